@@ -1,0 +1,36 @@
+//! From an image to the modules in it.
+
+use crate::geometry::Quad;
+use serde::{Deserialize, Serialize};
+
+/// Which detector found a module.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Source {
+    /// The semantic segmentation network (paper, 3.2).
+    Unet,
+    /// The instance segmentation network that complements it.
+    Yolo,
+    /// Boxes made by another program or a person.
+    External,
+}
+
+/// One module seen in one image.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Detection {
+    /// Corners in pixels of the undistorted image.
+    pub quad: Quad,
+    /// 0 to 1.
+    pub score: f32,
+    pub source: Source,
+}
+
+/// All modules seen in one image.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ImageDetections {
+    /// Name of the shot.
+    pub image: String,
+    pub width_px: u32,
+    pub height_px: u32,
+    pub detections: Vec<Detection>,
+}

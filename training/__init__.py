@@ -1,0 +1,1 @@
+"""Training of heliomap's module segmentation network."""
