@@ -11,10 +11,11 @@ Rng = np.random.Generator
 
 
 def transform(points: np.ndarray, h: np.ndarray) -> np.ndarray:
+    """Applies a homography; points beyond its horizon become NaN."""
     shape = points.shape
     p = points.reshape(-1, 2)
     q = np.concatenate([p, np.ones((len(p), 1))], axis=1) @ h.T
-    return (q[:, :2] / q[:, 2:]).reshape(shape)
+    return (q[:, :2] / np.where(q[:, 2:] > 0.15, q[:, 2:], np.nan)).reshape(shape)
 
 
 def crop(photo: Photo, size: int, rng: Rng, short_side: tuple[float, float]) -> tuple[np.ndarray, np.ndarray, list]:
@@ -59,23 +60,24 @@ def crop(photo: Photo, size: int, rng: Rng, short_side: tuple[float, float]) -> 
     if k > 1:
         image = cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA)
     quads = transform(photo.quads, m)
-    ignore = [transform(p, m) for p in photo.ignore]
+    ignore = [p for p in (transform(p, m) for p in photo.ignore) if np.isfinite(p).all()]
     # Outside of the photo nothing is known.
     frame = np.array([[-0.5, -0.5], [w - 0.5, -0.5], [w - 0.5, h - 0.5], [-0.5, h - 0.5]])
-    outer = np.array([[-9.0, -9], [size + 9, -9], [size + 9, size + 9], [-9, size + 9]])
     inside = transform(frame, m)
+    middle = transform(np.array([[w / 2, h / 2]]), m)[0]
     for i in range(4):
         e0, e1 = inside[i], inside[(i + 1) % 4]
         d = e1 - e0
         n = np.array([d[1], -d[0]])
-        if np.dot(n, inside.mean(axis=0) - e0) > 0:
+        if np.dot(n, middle - e0) > 0:
             n = -n
         n = n / (np.linalg.norm(n) + 1e-9) * 4 * size
         d = d / (np.linalg.norm(d) + 1e-9) * 4 * size
+        if not np.isfinite(e0 + e1).all():
+            continue
         strip = np.array([e0 - d, e1 + d, e1 + d + n, e0 - d + n])
         if strip[:, 0].max() > 0 and strip[:, 1].max() > 0 and (strip.min(axis=0) < size).all():
             ignore.append(np.clip(strip, -20 * size, 20 * size))
-    del outer
     return image, quads, ignore
 
 
@@ -99,7 +101,7 @@ def photometric(image: np.ndarray, rng: Rng, strength: float = 1.0) -> np.ndarra
         a = rng.uniform(0, 0.35)
         x = x * (1 - a) + a * (rng.uniform(0.5, 1.0) + rng.normal(0, 0.04, 3).astype(np.float32))
     if rng.random() < 0.8:
-        x = x * np.exp(rng.normal(0, 0.06 * strength, 3)).astype(np.float32)
+        x = x * np.exp(rng.normal(0, 0.09 * strength, 3)).astype(np.float32)
         gray = x.mean(axis=2, keepdims=True)
         x = gray + (x - gray) * np.float32(rng.uniform(0.4, 1.5) if strength > 0.5 else rng.uniform(0.8, 1.2))
         x = np.clip(x, 0, None) ** np.float32(np.exp(rng.normal(0, 0.22 * strength)))

@@ -27,6 +27,7 @@ class Photo:
     quads: np.ndarray
     ignore: list[np.ndarray] = field(default_factory=list)
     conditions: dict = field(default_factory=dict)
+    gsd: float | None = None  # metres per pixel where known
 
     @property
     def module_px(self) -> float:
@@ -86,8 +87,15 @@ def load_render(folder: Path) -> list[Photo]:
         image = read_rgb(path)
         h, w = image.shape[:2]
         quads = project(corners, shot, truth["camera"], w, h).reshape(-1, 4, 2)
+        height = shot["center"][2] - float(corners[:, 2].mean())
         photos.append(
-            Photo(f"{folder.name}/{shot['name']}", image, visible(quads, w, h), conditions=truth.get("conditions", {}))
+            Photo(
+                f"{folder.name}/{shot['name']}",
+                image,
+                visible(quads, w, h),
+                conditions=truth.get("conditions") or {},
+                gsd=height / (truth["camera"]["focal_norm"] * max(w, h)),
+            )
         )
     return photos
 

@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 
 CORE_SHRINK = 0.62
+GSD = 0.04  # metres per pixel at which photos outside of the range are run
+GSD_RANGE = (0.025, 0.085)
 SUPER = 4
 SHIFT = 4
 
@@ -36,6 +38,7 @@ def make_targets(quads: np.ndarray, ignore: list[np.ndarray], size: int) -> tupl
 
     The face outside the core gets more weight on the core channel: that ring is what keeps neighbours apart.
     """
+    quads = quads[np.isfinite(quads).all(axis=(1, 2))]
     quads = quads[(quads.max(axis=1) > -8).all(axis=1) & (quads.min(axis=1) < size + 8).all(axis=1)]
     module = fill(quads, size)
     core = fill(shrink(quads, CORE_SHRINK), size)

@@ -1,0 +1,74 @@
+"""The model card, written by `training.evaluate --card`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+HEAD = """# unet.onnx
+
+Version {version}, {size:.1f} MB, {steps} steps of training. Written by `python -m training.evaluate`: do not edit.
+
+A small residual U-Net that marks photovoltaic modules in drone photos. It is ours, under this repository's licence.
+
+| | |
+|---|---|
+| input `image` | float32 [N, 3, H, W], RGB in 0..1, H and W multiples of 32 |
+| output `masks` | float32 [N, 2, H, W], probabilities: `module` (the face within its four corners), `core` (the face shrunk to {shrink} about its centre, so that neighbours never touch) |
+| working distance | {gsd} m per pixel; trained for {gsd_range} m (a module's short side 9 to 44 pixels) |
+| speed | {speed:.2f} s per megapixel, ONNX Runtime, {threads} threads, float32, measured by the run that wrote this card |
+
+Metadata of the file (`heliomap.*`) says the same to programs. From masks to boxes: `training/postprocess.py`.
+
+## Data
+
+| source | use | licence |
+|---|---|---|
+| rendered plants `train/00` to `09`, `14` to `59`, 168 photos | training | ours, CC0 |
+| drawn pictures, endless (`training/draw.py`) | training | ours |
+| `real-labelled`: four of five hand-labelled frames of one real plant | training | MIT, as its source states |
+{own}| rendered plants `train/10` to `13`, `example` | test | ours, CC0 |
+| `real-labelled/tsukuba_vegetation` | test (same plant as the four above, another frame) | MIT, as its source states |
+
+No photo of any of these is in the repository. The example is rendered like the training plants, but no photo of it was
+trained on.
+
+## Figures
+
+Boxes against the modules wholly inside the frame; a match has an IoU of at least 0.5. "Worst" is the recall of the
+worst photo. Centre errors are medians, in pixels of the photo as given (the real frames run at half and a third of
+their size). Splits: modules with two boxes. Merges: boxes over two modules. Glare counts in full.
+
+| set | modules | recall % | worst % | precision % | mean IoU | centre px | splits | merges |
+|---|---|---|---|---|---|---|---|---|
+"""
+
+OWN = "| `missouri-west`: {frames} frames without labels; lattices fitted to predictions (`training/bootstrap.py`), the northern fifth never used | training | its authors state no licence: only weights derived, nothing of the photos ships |\n"
+
+TAIL = """
+## Limits
+
+{limits}
+"""
+
+
+def write_card(path: Path, model: Path, meta: dict, rows: dict[str, dict], speed: float, threads: int) -> None:
+    frames = meta.get("heliomap.self_frames", "0")
+    text = HEAD.format(
+        version=meta.get("heliomap.version", "?"),
+        size=model.stat().st_size / 1e6,
+        steps=meta.get("heliomap.steps", "?"),
+        shrink=meta.get("heliomap.core_shrink", "?"),
+        gsd=meta.get("heliomap.gsd_m", "?"),
+        gsd_range=meta.get("heliomap.gsd_range_m", "?").replace(",", " to "),
+        speed=speed,
+        threads=threads,
+        own=OWN.format(frames=frames) if frames != "0" else "",
+    )
+    for name, r in rows.items():
+        text += (
+            f"| {name} | {r['modules']} | {r['recall']} | {r['worst']} | {r['precision']} | {r['iou']} "
+            f"| {r['center_px']} | {r['splits']} | {r['merges']} |\n"
+        )
+    limits = Path(__file__).with_name("limits.md")
+    text += TAIL.format(limits=limits.read_text().strip() if limits.exists() else "")
+    path.write_text(text)

@@ -1,0 +1,209 @@
+"""Measures a model: `python -m training.evaluate --model models/unet.onnx [--card models/unet.md]`.
+
+Recall, precision at IoU 0.5 of oriented boxes against the modules wholly inside the frame (what is cut by the frame
+or lies in an ignored area counts neither way), mean IoU, median centre error, splits, merges, per plant and frame.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from . import sources
+from .postprocess import Box, boxes, overlap, quad_area, touches_frame
+from .runner import Runner, resample
+from .sources import Photo
+from .targets import CORE_SHRINK, GSD, GSD_RANGE
+
+
+@dataclass
+class Score:
+    """Counts of one photo, or sums over many."""
+
+    truth: int = 0
+    found: int = 0
+    boxes: int = 0
+    false: int = 0
+    splits: int = 0
+    merges: int = 0
+    ious: list[float] = field(default_factory=list)
+    errors: list[float] = field(default_factory=list)
+    worst: float = 1.0
+
+    def add(self, o: "Score") -> None:
+        for k in ("truth", "found", "boxes", "false", "splits", "merges"):
+            setattr(self, k, getattr(self, k) + getattr(o, k))
+        self.ious += o.ious
+        self.errors += o.errors
+        if o.truth:
+            self.worst = min(self.worst, o.recall)
+
+    @property
+    def recall(self) -> float:
+        return self.found / self.truth if self.truth else 1.0
+
+    @property
+    def precision(self) -> float:
+        return 1 - self.false / self.boxes if self.boxes else 1.0
+
+    def row(self) -> dict:
+        return {
+            "modules": self.truth,
+            "recall": round(100 * self.recall, 2),
+            "worst": round(100 * self.worst, 2),
+            "precision": round(100 * self.precision, 2),
+            "iou": round(float(np.mean(self.ious)), 3) if self.ious else None,
+            "center_px": round(float(np.median(self.errors)), 3) if self.errors else None,
+            "splits": self.splits,
+            "merges": self.merges,
+        }
+
+
+def inside(quads: np.ndarray, w: int, h: int) -> np.ndarray:
+    return ((quads >= -0.5) & (quads <= np.array([w - 0.5, h - 0.5]))).all(axis=(1, 2))
+
+
+def compare(photo: Photo, found: list[Box], scale: float = 1.0) -> Score:
+    """Greedy matching by IoU. Boxes are in the photo's own pixels."""
+    h, w = photo.image.shape[:2]
+    ins = inside(photo.quads, w, h)
+    found = [b for b in found if not touches_frame(b, w, h)]
+    s = Score(truth=int(ins.sum()))
+    centers = photo.quads.mean(axis=1) if len(photo.quads) else np.zeros((0, 2))
+    pairs = []
+    for j, b in enumerate(found):
+        c = b.corners
+        area = quad_area(c)
+        near = np.nonzero(np.linalg.norm(centers - b.center, axis=1) < 1.5 * b.length)[0]
+        covered = 0
+        for i in near:
+            q = photo.quads[i]
+            a = quad_area(q)
+            x = overlap(q, c)
+            covered += x > 0.5 * a
+            pairs.append((x / (a + area - x), i, j))
+        s.merges += covered > 1
+    pairs.sort(reverse=True)
+    used_i, used_j = set(), set()
+    for iou, i, j in pairs:
+        if iou < 0.5 or i in used_i or j in used_j:
+            continue
+        used_i.add(i)
+        used_j.add(j)
+        if ins[i]:
+            s.found += 1
+            s.boxes += 1
+            s.ious.append(iou)
+            s.errors.append(float(np.linalg.norm(centers[i] - found[j].center)))
+    for j, b in enumerate(found):
+        if j in used_j:
+            continue
+        p = (float(b.center[0]), float(b.center[1]))
+        if any(cv2.pointPolygonTest(g.astype(np.float32), p, False) >= 0 for g in photo.ignore):
+            continue
+        hit = [i for _, i, k in pairs if k == j and cv2.pointPolygonTest(photo.quads[i].astype(np.float32), p, False) >= 0]
+        if hit and not ins[hit[0]]:
+            continue  # on a module that the frame cuts
+        s.boxes += 1
+        s.false += 1
+    for i in np.nonzero(ins)[0]:
+        q = photo.quads[i].astype(np.float32)
+        s.splits += sum(cv2.pointPolygonTest(q, (float(b.center[0]), float(b.center[1])), False) >= 0 for b in found) > 1
+    s.worst = s.recall
+    return s
+
+
+def detect(runner: Runner, photo: Photo, scale: float = 1.0, shrink: float = CORE_SHRINK) -> tuple[list[Box], np.ndarray]:
+    """Boxes in the photo's own pixels, and the probabilities at the working scale."""
+    prob = runner(resample(photo.image, scale))
+    found = boxes(prob, shrink)
+    size = np.array([photo.image.shape[1] / prob.shape[2], photo.image.shape[0] / prob.shape[1]])
+    for b in found:
+        b.center = (b.center + 0.5) * size - 0.5
+        b.u, b.v = b.u * size, b.v * size
+    return found, prob
+
+
+def working_scale(gsd: float | None) -> float:
+    """Photos within the liked range run as they are, others at the working distance."""
+    if gsd is None or GSD_RANGE[0] <= gsd <= GSD_RANGE[1]:
+        return 1.0
+    return gsd / GSD
+
+
+def overlay(photo: Photo, found: list[Box], path: Path, truth: bool = True) -> None:
+    """Draws boxes (green) over the photo, missed modules in red."""
+    img = cv2.cvtColor(photo.image, cv2.COLOR_RGB2BGR).copy()
+    h, w = img.shape[:2]
+    if truth and len(photo.quads):
+        for q, ok in zip(photo.quads, inside(photo.quads, w, h)):
+            if ok and not any(cv2.pointPolygonTest(q.astype(np.float32), (float(b.center[0]), float(b.center[1])), False) >= 0 for b in found):
+                cv2.polylines(img, [np.round(q * 16).astype(np.int32)], True, (0, 0, 255), 2, cv2.LINE_AA, 4)
+    for b in found:
+        color = (0, 255, 0) if not touches_frame(b, w, h) else (255, 160, 0)
+        cv2.polylines(img, [np.round(b.corners * 16).astype(np.int32)], True, color, 1, cv2.LINE_AA, 4)
+        cv2.circle(img, tuple(np.round(b.center).astype(int).tolist()), 1, (0, 255, 255), -1)
+    cv2.imwrite(str(path), img)
+
+
+def test_sets() -> dict[str, list[tuple[Photo, float]]]:
+    """Name of the set to its photos and the scale at which each is run."""
+    sets: dict[str, list[tuple[Photo, float]]] = {}
+    for folder in sources.render_folders(test=True):
+        sets[f"train/{folder.name}"] = [(p, working_scale(p.gsd)) for p in sources.load_render(folder)]
+    example = sources.data_root() / "example"
+    if (example / "truth.json").exists():
+        sets["example"] = [(p, working_scale(p.gsd)) for p in sources.load_render(example)]
+    # The real frames are far sharper than the working distance: halved and at a third.
+    held = sources.real_frames(test=True)
+    sets["real held out, 1/2"] = [(p, 0.5) for p in held]
+    sets["real held out, 1/3"] = [(p, 1 / 3) for p in held]
+    return sets
+
+
+def main() -> None:
+    p = argparse.ArgumentParser(description=__doc__)
+    p.add_argument("--model", type=Path, default=Path("models/unet.onnx"), help=".onnx, or a checkpoint .pt")
+    p.add_argument("--card", type=Path, help="write the model card here")
+    p.add_argument("--overlay", type=Path, help="write overlays into this folder")
+    p.add_argument("--only", help="only sets whose name contains this")
+    p.add_argument("--threads", type=int, default=2)
+    a = p.parse_args()
+    cv2.setNumThreads(a.threads)
+    runner = Runner(a.model, a.threads)
+    rows: dict[str, dict] = {}
+    for name, photos in test_sets().items():
+        if a.only and a.only not in name:
+            continue
+        total = Score()
+        for photo, scale in photos:
+            found, _ = detect(runner, photo, scale)
+            total.add(compare(photo, found))
+            if a.overlay:
+                a.overlay.mkdir(parents=True, exist_ok=True)
+                overlay(photo, found, a.overlay / f"{name}-{Path(photo.name).stem}.png".replace("/", "_").replace(" ", "_"))
+        rows[name] = total.row()
+        print(name, json.dumps(rows[name]), flush=True)
+    x = np.random.default_rng(0).integers(0, 255, (896, 1344, 3), dtype=np.uint8)
+    runner(x)
+    times = []
+    for _ in range(5):
+        begun = time.time()
+        runner(x)
+        times.append(time.time() - begun)
+    per_mp = float(np.median(times)) / (x.shape[0] * x.shape[1] / 1e6)
+    print(f"{per_mp:.3f} s per megapixel, {a.threads} threads")
+    if a.card:
+        from .card import write_card
+
+        write_card(a.card, a.model, runner.meta, rows, per_mp, a.threads)
+
+
+if __name__ == "__main__":
+    main()

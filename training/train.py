@@ -1,0 +1,138 @@
+"""Trains the network: `python -m training.train --out DIR [--minutes N]`. Run it again to resume."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import signal
+import time
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # numpy draws in the loader: its threads would fight torch's
+
+import cv2
+import torch
+from torch.utils.data import DataLoader
+
+from . import sources
+from .dataset import Stream
+from .loss import loss_fn
+from .net import WIDTHS, UNet
+
+
+def arguments() -> argparse.Namespace:
+    p = argparse.ArgumentParser(description=__doc__)
+    p.add_argument("--out", type=Path, default=Path("runs/unet"), help="folder of checkpoints and the log")
+    p.add_argument("--steps", type=int, default=5000, help="length of the learning-rate schedule")
+    p.add_argument("--minutes", type=float, default=0, help="stop after so many minutes (0: when the steps are done)")
+    p.add_argument("--batch", type=int, default=6)
+    p.add_argument("--size", type=int, default=256, help="side of a crop in pixels")
+    p.add_argument("--lr", type=float, default=2e-3)
+    p.add_argument("--seed", type=int, default=7)
+    p.add_argument("--threads", type=int, default=2)
+    p.add_argument("--workers", type=int, default=1)
+    p.add_argument("--renders", type=float, default=0.40, help="share of crops of rendered plants")
+    p.add_argument("--real", type=float, default=0.18, help="share of crops of hand-labelled real frames")
+    p.add_argument("--self", dest="own", type=float, default=0.0, help="share of crops of self-labelled frames")
+    p.add_argument("--self-labels", help="labels file of the self-labelled frames (training.bootstrap)")
+    p.add_argument("--init", type=Path, help="start from the averaged weights of this checkpoint")
+    p.add_argument("--save-every", type=float, default=120, help="seconds between checkpoints")
+    return p.parse_args()
+
+
+def schedule(step: int, steps: int) -> float:
+    warm = min(1.0, (step + 1) / 100)
+    return warm * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * min(1.0, step / steps))))
+
+
+def main() -> None:
+    a = arguments()
+    a.out.mkdir(parents=True, exist_ok=True)
+    torch.manual_seed(a.seed)
+    torch.set_num_threads(a.threads)
+    cv2.setNumThreads(0)  # OpenCV's thread pool does not survive the fork of the loader's processes
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    net = UNet(WIDTHS).to(device, memory_format=torch.channels_last)
+    mean = UNet(WIDTHS).to(device)  # running average of the weights: what is exported
+    opt = torch.optim.AdamW(net.parameters(), lr=a.lr, weight_decay=1e-3)
+    step = 0
+    path = a.out / "checkpoint.pt"
+    if path.exists():
+        state = torch.load(path, map_location=device, weights_only=True)
+        net.load_state_dict(state["net"])
+        mean.load_state_dict(state["mean"])
+        opt.load_state_dict(state["opt"])
+        step = state["step"]
+        print(f"resumed at step {step}", flush=True)
+    elif a.init:
+        state = torch.load(a.init, map_location=device, weights_only=True)
+        net.load_state_dict(state["mean"])
+        mean.load_state_dict(state["mean"])
+    else:
+        mean.load_state_dict(net.state_dict())
+
+    def save() -> None:
+        state = {"net": net.state_dict(), "mean": mean.state_dict(), "opt": opt.state_dict(), "step": step, "widths": WIDTHS}
+        torch.save(state, path.with_suffix(".tmp"))
+        os.replace(path.with_suffix(".tmp"), path)
+
+    stop = False
+
+    def on_signal(*_: object) -> None:
+        nonlocal stop
+        stop = True
+
+    signal.signal(signal.SIGTERM, on_signal)
+    signal.signal(signal.SIGINT, on_signal)
+
+    mix = [
+        (a.renders, sources.train_renders()),
+        (a.real, sources.real_frames(test=False)),
+        (a.own, sources.self_labelled(a.self_labels)),
+    ]
+    print("photos:", [len(p) for _, p in mix], flush=True)
+    stream = Stream(mix, a.size, a.seed, start=step * a.batch)
+    loader = iter(DataLoader(stream, a.batch, num_workers=a.workers, prefetch_factor=6 if a.workers else None))
+    net.train()
+    begun = saved = time.time()
+    average, first = 0.0, step
+    while step < a.steps and not stop:
+        for g in opt.param_groups:
+            g["lr"] = a.lr * schedule(step, a.steps)
+        x, y, w = (t.to(device) for t in next(loader))
+        x = x.contiguous(memory_format=torch.channels_last)
+        with torch.autocast(device.type, torch.bfloat16):
+            logits = net(x)
+        loss = loss_fn(logits.float(), y, w)
+        opt.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(net.parameters(), 2.0)
+        opt.step()
+        step += 1
+        with torch.no_grad():
+            k = min(0.995, step / (step + 10))
+            for m, n in zip(mean.state_dict().values(), net.state_dict().values()):
+                if m.dtype.is_floating_point:
+                    m.lerp_(n, 1 - k)
+                else:
+                    m.copy_(n)
+        average = loss.item() if average == 0 else 0.98 * average + 0.02 * loss.item()
+        now = time.time()
+        if step % 50 == 0:
+            pace = (now - begun) / (step - first)
+            print(f"step {step} loss {average:.4f} {pace:.2f} s/step", flush=True)
+            with open(a.out / "log.jsonl", "a") as f:
+                f.write(json.dumps({"step": step, "loss": round(average, 5), "s_per_step": round(pace, 3)}) + "\n")
+        if now - saved > a.save_every:
+            save()
+            saved = now
+        if a.minutes and now - begun > a.minutes * 60:
+            break
+    save()
+    print(f"stopped at step {step}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
