@@ -4,7 +4,10 @@
 //! `detection`, `layout`, `fusion`, `refinement`, `plant`, `pipeline`; then `store` and `jobs`; then `http`.
 
 pub mod detection;
+pub mod fusion;
 pub mod geometry;
+pub mod layout;
 pub mod pipeline;
 pub mod plant;
 pub mod reconstruction;
+pub mod refinement;

@@ -1,5 +1,7 @@
 //! From an image to the modules in it.
 
+pub mod external;
+
 use crate::geometry::Quad;
 use serde::{Deserialize, Serialize};
 

@@ -44,9 +44,9 @@ impl Lla {
             } else {
                 ecef.z / sin_lat - prime_vertical_m * (1.0 - ECCENTRICITY_SQUARED)
             };
-            latitude = ecef
-                .z
-                .atan2(distance_to_axis * (1.0 - ECCENTRICITY_SQUARED * prime_vertical_m / (prime_vertical_m + height)));
+            latitude = ecef.z.atan2(
+                distance_to_axis * (1.0 - ECCENTRICITY_SQUARED * prime_vertical_m / (prime_vertical_m + height)),
+            );
         }
         Self { latitude_deg: latitude.to_degrees(), longitude_deg: longitude.to_degrees(), height_m: height }
     }

@@ -121,11 +121,7 @@ mod tests {
     use super::*;
 
     fn square(x: f64, y: f64, side: f64) -> Quad {
-        Quad::from_center(
-            Vector2::new(x, y),
-            Vector2::new(side / 2.0, 0.0),
-            Vector2::new(0.0, side / 2.0),
-        )
+        Quad::from_center(Vector2::new(x, y), Vector2::new(side / 2.0, 0.0), Vector2::new(0.0, side / 2.0))
     }
 
     #[test]

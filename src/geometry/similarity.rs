@@ -59,7 +59,9 @@ mod tests {
     use super::*;
 
     fn points() -> Vec<Vector3<f64>> {
-        (0..20).map(|k| Vector3::new(f64::from(k % 5) * 3.0, f64::from(k / 5) * 7.0, f64::from(k * k % 7) * 0.3)).collect()
+        (0..20)
+            .map(|k| Vector3::new(f64::from(k % 5) * 3.0, f64::from(k / 5) * 7.0, f64::from(k * k % 7) * 0.3))
+            .collect()
     }
 
     #[test]

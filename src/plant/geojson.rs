@@ -196,10 +196,7 @@ fn outline(members: &[&Module]) -> Option<[Vector3<f64>; 4]> {
     let mut corners = [first.corners_enu_m[0]; 4];
     for (slot, (sign_along, sign_up)) in corners.iter_mut().zip([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)]) {
         let reach = |corner: &Vector3<f64>| sign_along * along.dot(corner) + sign_up * up.dot(corner);
-        *slot = *members
-            .iter()
-            .flat_map(|m| m.corners_enu_m.iter())
-            .max_by(|a, b| reach(a).total_cmp(&reach(b)))?;
+        *slot = *members.iter().flat_map(|m| m.corners_enu_m.iter()).max_by(|a, b| reach(a).total_cmp(&reach(b)))?;
     }
     Some(corners)
 }

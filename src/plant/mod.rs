@@ -1,5 +1,6 @@
 //! The result: the model of a plant, its identifiers and labels, and its exports.
 
+pub mod assemble;
 pub mod geojson;
 pub mod ids;
 pub mod model;

@@ -1,0 +1,210 @@
+//! Pieces of one bench become the bench: which places hold a module, which hypotheses are confirmed, where it ends
+//! (paper, 3.5).
+
+use super::associate::Clusters;
+use super::{Doubt, LocatedPiece, View};
+use crate::layout::End;
+use nalgebra::{Vector2, Vector3};
+use std::collections::{BTreeMap, BTreeSet};
+
+/// A module seen in one view.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Observation {
+    pub view: usize,
+    /// Index into the view's detections.
+    pub detection: usize,
+    /// Where this view alone puts it, metres.
+    pub position_m: Vector3<f64>,
+    /// What the cloud says at its ray (paper, 3.4), metres.
+    pub cloud_m: Option<Vector3<f64>>,
+}
+
+/// A module of the fused structure.
+#[derive(Debug, Clone)]
+pub struct FusedModule {
+    /// Row from the north, 0 the first.
+    pub row: i32,
+    /// Column from the west, 0 the first; a missing module leaves its column free.
+    pub col: i32,
+    /// Sorted by view.
+    pub observations: Vec<Observation>,
+    /// Views that only inferred it.
+    pub inferred_in: Vec<usize>,
+}
+
+/// A bench of the fused structure.
+#[derive(Debug, Clone)]
+pub struct FusedBench {
+    pub rows: i32,
+    pub cols: i32,
+    /// Sorted by row and column.
+    pub modules: Vec<FusedModule>,
+    /// Whether the images end before the bench does, in the west and in the east.
+    pub open_ended: [bool; 2],
+    /// 0 to 1.
+    pub confidence: f64,
+    /// Mean position of its modules, metres.
+    pub middle_m: Vector3<f64>,
+    /// Mean metres per column and per row in the horizontal plane.
+    pub pitch_m: [Vector2<f64>; 2],
+}
+
+/// What the views say of one place in a bench.
+#[derive(Default)]
+struct Votes {
+    observations: Vec<Observation>,
+    /// Views whose piece has the place as a hypothesis.
+    inferred: BTreeSet<usize>,
+    /// Views that show the place past the end of their piece, empty.
+    absent: BTreeSet<usize>,
+}
+
+/// Assembles the benches from their pieces.
+pub fn assemble(
+    views: &[View<'_>],
+    pieces: &[LocatedPiece],
+    clusters: &Clusters,
+    doubts: &mut Vec<Doubt>,
+) -> Vec<FusedBench> {
+    clusters
+        .members
+        .iter()
+        .zip(&clusters.margins)
+        .filter_map(|(members, margin)| assemble_bench(views, pieces, clusters, members, *margin, doubts))
+        .collect()
+}
+
+fn assemble_bench(
+    views: &[View<'_>],
+    pieces: &[LocatedPiece],
+    clusters: &Clusters,
+    members: &[usize],
+    margin: f64,
+    doubts: &mut Vec<Doubt>,
+) -> Option<FusedBench> {
+    let mut votes: BTreeMap<(i32, i32), Votes> = BTreeMap::new();
+    for &member in members {
+        let (piece, place) = (&pieces[member], clusters.placements[member]);
+        for cell in &piece.cells {
+            let entry = votes.entry((cell.row + place.row, cell.col + place.col)).or_default();
+            match cell.detection {
+                Some(detection) => entry.observations.push(Observation {
+                    view: piece.view,
+                    detection,
+                    position_m: cell.position_m,
+                    cloud_m: cell.cloud_m,
+                }),
+                None => {
+                    entry.inferred.insert(piece.view);
+                }
+            }
+        }
+    }
+    let places: Vec<(i32, i32)> = votes.keys().copied().collect();
+    for &member in members {
+        let (piece, place) = (&pieces[member], clusters.placements[member]);
+        for &(row, col) in &places {
+            let (r, c) = (row - place.row, col - place.col);
+            let beyond = (c < 0 && piece.west == End::Closed)
+                || (c >= piece.cols && piece.east == End::Closed)
+                || (r < 0 && piece.north == End::Closed)
+                || (r >= piece.rows && piece.south == End::Closed);
+            // Only next to the piece is it sure to be in the image.
+            let near = (-1..=piece.cols).contains(&c) && (-1..=piece.rows).contains(&r);
+            if beyond && near {
+                if let Some(entry) = votes.get_mut(&(row, col)) {
+                    entry.absent.insert(piece.view);
+                }
+            }
+        }
+    }
+    for entry in votes.values_mut() {
+        // A view that shows the place in another of its pieces does not miss it.
+        for observation in &entry.observations {
+            entry.absent.remove(&observation.view);
+            entry.inferred.remove(&observation.view);
+        }
+    }
+    // Modules are those that were visually confirmed; past the ends that most views see, one detection is no proof.
+    let mut accepted: BTreeMap<(i32, i32), Votes> = votes
+        .into_iter()
+        .filter(|(_, v)| !v.observations.is_empty() && v.observations.len() > v.absent.len() / 2)
+        .collect();
+    let seen_by: BTreeSet<usize> = accepted.values().flat_map(|v| v.observations.iter().map(|o| o.view)).collect();
+    // Two boxes that one view alone saw beside each other are no bench.
+    if accepted.len() < 2 || (accepted.len() < 4 && seen_by.len() < 2) {
+        return None;
+    }
+    let low_row = accepted.keys().map(|p| p.0).min()?;
+    let low_col = accepted.keys().map(|p| p.1).min()?;
+    let rows = accepted.keys().map(|p| p.0).max()? - low_row + 1;
+    let cols = accepted.keys().map(|p| p.1).max()? - low_col + 1;
+    let closed = |f: fn(&LocatedPiece) -> End, at: fn(&LocatedPiece) -> i32, offset: i32| {
+        members
+            .iter()
+            .any(|&m| f(&pieces[m]) == End::Closed && clusters.placements[m].col + at(&pieces[m]) - low_col == offset)
+    };
+    let open_ended = [!closed(|p| p.west, |_| 0, 0), !closed(|p| p.east, |p| p.cols - 1, cols - 1)];
+    let mut middle_m = Vector3::zeros();
+    let mut modules = Vec::with_capacity(accepted.len());
+    for ((row, col), entry) in &mut accepted {
+        entry.observations.sort_by_key(|o| (o.view, o.detection));
+        entry.observations.dedup_by_key(|o| o.view);
+        middle_m +=
+            entry.observations.iter().map(|o| o.position_m).sum::<Vector3<f64>>() / entry.observations.len() as f64;
+        modules.push(FusedModule {
+            row: row - low_row,
+            col: col - low_col,
+            observations: std::mem::take(&mut entry.observations),
+            inferred_in: entry.inferred.iter().copied().collect(),
+        });
+    }
+    middle_m /= modules.len() as f64;
+    let mean_pitch = |axis: usize| {
+        let sum: Vector2<f64> =
+            members.iter().map(|m| pieces[*m].pitch_m()[axis] * pieces[*m].cells.len() as f64).sum();
+        let weight: usize = members.iter().map(|m| pieces[*m].cells.len()).sum();
+        sum / weight as f64
+    };
+    let holes = rows * cols - modules.len() as i32;
+    let joint = if margin.is_finite() { 1.0 - (-margin).exp() } else { 0.9 };
+    let bench = FusedBench {
+        rows,
+        cols,
+        modules,
+        open_ended,
+        confidence: (joint * (1.0 - 0.5 * f64::from(holes) / f64::from(rows * cols))).clamp(0.0, 1.0),
+        middle_m,
+        pitch_m: [mean_pitch(0), mean_pitch(1)],
+    };
+    doubts.extend(holes_to_check(views, &bench));
+    Some(bench)
+}
+
+/// Places inside the bench where no view detected a module: said, not filled.
+fn holes_to_check(views: &[View<'_>], bench: &FusedBench) -> Option<Doubt> {
+    let present: BTreeSet<(i32, i32)> = bench.modules.iter().map(|m| (m.row, m.col)).collect();
+    let missing: Vec<String> = (0..bench.rows)
+        .flat_map(|row| (0..bench.cols).map(move |col| (row, col)))
+        .filter(|place| !present.contains(place))
+        .map(|(row, col)| format!("row {} number {}", row + 1, col + 1))
+        .collect();
+    if missing.is_empty() {
+        return None;
+    }
+    let images: BTreeSet<&str> =
+        bench.modules.iter().flat_map(|m| m.observations.iter().map(|o| views[o.view].shot.name.as_str())).collect();
+    let shown = missing.iter().take(6).cloned().collect::<Vec<_>>().join(", ");
+    let more = if missing.len() > 6 { format!(" and {} more", missing.len() - 6) } else { String::new() };
+    Some(Doubt {
+        code: "modules_not_seen",
+        message: format!(
+            "the bench at {:.1} m east, {:.1} m north has {} places where no image shows a module ({shown}{more}): they \
+             are missing, or under glare in every image",
+            bench.middle_m.x,
+            bench.middle_m.y,
+            missing.len(),
+        ),
+        images: images.into_iter().map(str::to_owned).collect(),
+    })
+}

@@ -1,0 +1,130 @@
+//! Benches one behind the other form lines.
+
+use super::FusedBench;
+use nalgebra::Vector2;
+
+/// How far apart the ends of two benches of one line may stand (a road lies between them), metres.
+const WIDEST_M: f64 = 15.0;
+/// How far the axes of two benches of one line may be turned against each other, degrees.
+const BEND_DEG: f64 = 12.0;
+
+/// A line: its benches from the west.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct FusedLine {
+    /// Indices into the benches.
+    pub benches: Vec<usize>,
+}
+
+/// A bench in the horizontal plane.
+struct Footprint {
+    along: Vector2<f64>,
+    across: Vector2<f64>,
+    west: Vector2<f64>,
+    east: Vector2<f64>,
+    /// Half its extent across, metres.
+    half_m: f64,
+}
+
+impl Footprint {
+    fn of(bench: &FusedBench) -> Self {
+        let along = bench.pitch_m[0].normalize();
+        let across = Vector2::new(along.y, -along.x);
+        let half_m = bench.pitch_m[1].dot(&across).abs() * f64::from(bench.rows) / 2.0;
+        // The middle of the lattice, not of the modules: holes must not pull it aside.
+        let lattice_middle = Vector2::new(f64::from(bench.cols - 1) / 2.0, f64::from(bench.rows - 1) / 2.0);
+        let count = bench.modules.len() as f64;
+        let mean = bench.modules.iter().map(|m| Vector2::new(f64::from(m.col), f64::from(m.row))).sum::<Vector2<f64>>()
+            / count;
+        let off = lattice_middle - mean;
+        let middle = bench.middle_m.xy() + bench.pitch_m[0] * off.x + bench.pitch_m[1] * off.y;
+        let reach = bench.pitch_m[0] * (f64::from(bench.cols) / 2.0);
+        Self { along, across, west: middle - reach, east: middle + reach, half_m }
+    }
+}
+
+/// Groups benches into lines and sorts both: lines from the north, benches from the west (where rows run north-south:
+/// lines from the east, benches from the north).
+pub fn arrange(benches: Vec<FusedBench>) -> (Vec<FusedLine>, Vec<FusedBench>) {
+    let footprints: Vec<Footprint> = benches.iter().map(Footprint::of).collect();
+    let count = benches.len();
+    let cell_m = WIDEST_M;
+    let key = |p: Vector2<f64>| ((p.x / cell_m).floor() as i64, (p.y / cell_m).floor() as i64);
+    let mut wests: std::collections::HashMap<(i64, i64), Vec<usize>> = std::collections::HashMap::new();
+    for (index, footprint) in footprints.iter().enumerate() {
+        wests.entry(key(footprint.west)).or_default().push(index);
+    }
+    // (distance, from, to): the east end of one faces the west end of the other.
+    let mut facing: Vec<(f64, usize, usize)> = Vec::new();
+    for (i, from) in footprints.iter().enumerate() {
+        let home = key(from.east);
+        for dx in -2..=2 {
+            for dy in -2..=2 {
+                for &j in wests.get(&(home.0 + dx, home.1 + dy)).into_iter().flatten() {
+                    let to = &footprints[j];
+                    if i == j || from.along.angle(&to.along) > BEND_DEG.to_radians() {
+                        continue;
+                    }
+                    let offset = to.west - from.east;
+                    let (gap, aside) = (offset.dot(&from.along), offset.dot(&from.across));
+                    if (-1.0..WIDEST_M).contains(&gap) && aside.abs() < 0.6 * (from.half_m + to.half_m) + 0.05 * gap {
+                        facing.push((gap.max(0.0) + 2.0 * aside.abs(), i, j));
+                    }
+                }
+            }
+        }
+    }
+    facing.sort_by(|a, b| a.0.total_cmp(&b.0).then((a.1, a.2).cmp(&(b.1, b.2))));
+    let mut next = vec![None; count];
+    let mut previous = vec![None; count];
+    for (_, i, j) in facing {
+        if next[i].is_none() && previous[j].is_none() {
+            next[i] = Some(j);
+            previous[j] = Some(i);
+        }
+    }
+    let mut seen = vec![false; count];
+    let mut lines: Vec<Vec<usize>> = Vec::new();
+    for start in (0..count).filter(|k| previous[*k].is_none()).chain(0..count) {
+        let mut line = Vec::new();
+        let mut at = Some(start);
+        while let Some(bench) = at.filter(|bench| !seen[*bench]) {
+            seen[bench] = true;
+            line.push(bench);
+            at = next[bench];
+        }
+        if !line.is_empty() {
+            lines.push(line);
+        }
+    }
+    // One order for the whole plant: across the rows of most modules.
+    let across = footprints
+        .iter()
+        .zip(&benches)
+        .map(|(footprint, bench)| footprint.across * bench.modules.len() as f64)
+        .sum::<Vector2<f64>>()
+        .try_normalize(1e-9)
+        .unwrap_or(Vector2::new(0.0, -1.0));
+    let place = |line: &Vec<usize>| {
+        let (mut sum, mut weight) = (0.0, 0.0);
+        for &bench in line {
+            let modules = benches[bench].modules.len() as f64;
+            sum += benches[bench].middle_m.xy().dot(&across) * modules;
+            weight += modules;
+        }
+        sum / weight
+    };
+    let mut placed: Vec<(f64, Vec<usize>)> = lines.into_iter().map(|line| (place(&line), line)).collect();
+    placed.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+    let order: Vec<usize> = placed.iter().flat_map(|(_, line)| line.iter().copied()).collect();
+    let mut new_index = vec![0; count];
+    for (new, old) in order.iter().enumerate() {
+        new_index[*old] = new;
+    }
+    let lines = placed
+        .into_iter()
+        .map(|(_, line)| FusedLine { benches: line.into_iter().map(|bench| new_index[bench]).collect() })
+        .collect();
+    let mut slots: Vec<Option<FusedBench>> = benches.into_iter().map(Some).collect();
+    let sorted = order.into_iter().filter_map(|old| slots[old].take()).collect();
+    (lines, sorted)
+}

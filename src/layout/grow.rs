@@ -1,0 +1,658 @@
+//! Benches grow from module to module: links between neighbours, cuts where a gap lies between them, lattice
+//! coordinates along the links, and hypotheses where a module is missing.
+
+use super::lattice::{LatticeMap, Sample};
+use super::transition;
+use super::{Cell, End, LayoutOptions, Piece};
+use crate::detection::ImageDetections;
+use crate::geometry::Quad;
+use image::GrayImage;
+use nalgebra::Vector2;
+use std::collections::{BTreeMap, HashMap, VecDeque};
+
+/// A module's neighbours stand 0.75 to this many of its own sides away; what is further is no neighbour.
+const REACH: f64 = 1.45;
+/// Share of the shorter pitch that a module may stand off its lattice (the paper's RANSAC threshold).
+const INLIER: f64 = 0.25;
+
+/// A detection as the growth sees it: its centre, and the side vectors of its box, `b` a quarter turn clockwise from `a`.
+#[derive(Clone, Copy)]
+struct Node {
+    center: Vector2<f64>,
+    sides: [Vector2<f64>; 2],
+}
+
+impl Node {
+    /// Side vector of one of the four directions: a, b, -a, -b.
+    fn direction(&self, d: usize) -> Vector2<f64> {
+        if d % 4 < 2 { self.sides[d % 2] } else { -self.sides[d % 2] }
+    }
+}
+
+/// A link to a neighbour: which, and by how many quarter turns its own frame is turned against ours.
+type Link = Option<(usize, usize)>;
+
+/// A connected set of modules with lattice coordinates.
+struct Component {
+    /// (column, row) of each node.
+    places: BTreeMap<(i32, i32), usize>,
+    /// Quarter turns of each node's frame against the component's.
+    turns: HashMap<usize, usize>,
+    bridges: Vec<i32>,
+}
+
+impl Component {
+    fn sides(&self, nodes: &[Node]) -> [Vector2<f64>; 2] {
+        [0, 1].map(|d| {
+            let mut x: Vec<f64> = Vec::with_capacity(self.places.len());
+            let mut y: Vec<f64> = Vec::with_capacity(self.places.len());
+            for node in self.places.values() {
+                let side = nodes[*node].direction(d + self.turns[node]);
+                x.push(side.x);
+                y.push(side.y);
+            }
+            Vector2::new(median(&mut x), median(&mut y))
+        })
+    }
+
+    fn map(&self, nodes: &[Node]) -> LatticeMap {
+        let samples: Vec<Sample> = self
+            .places
+            .iter()
+            .map(|((col, row), node)| Sample { col: f64::from(*col), row: f64::from(*row), pixel: nodes[*node].center })
+            .collect();
+        let [u, v] = self.sides(nodes);
+        LatticeMap::fit(&samples, u * 1.02, v * 1.02)
+    }
+
+    fn col_range(&self) -> (i32, i32) {
+        range(self.places.keys().map(|place| place.0))
+    }
+
+    fn row_range(&self) -> (i32, i32) {
+        range(self.places.keys().map(|place| place.1))
+    }
+}
+
+fn range(values: impl Iterator<Item = i32>) -> (i32, i32) {
+    values.fold((i32::MAX, i32::MIN), |(low, high), v| (low.min(v), high.max(v)))
+}
+
+fn median(values: &mut [f64]) -> f64 {
+    let middle = values.len() / 2;
+    *values.select_nth_unstable_by(middle, f64::total_cmp).1
+}
+
+/// Grows the pieces of benches in one image; the second value lists detections that belong to none.
+pub(super) fn grow(
+    detections: &ImageDetections,
+    grey: Option<&GrayImage>,
+    options: &LayoutOptions,
+) -> (Vec<Piece>, Vec<usize>) {
+    let nodes: Vec<Node> = detections
+        .detections
+        .iter()
+        .map(|detection| Node { center: detection.quad.center(), sides: detection.quad.sides() })
+        .collect();
+    let mut links = find_links(&nodes);
+    let loose_components = components(&nodes, &links);
+    for component in &loose_components {
+        cut_gaps(component, &nodes, &mut links, detections, grey, options);
+    }
+    let mut grown: Vec<Component> = components(&nodes, &links);
+    for component in &mut grown {
+        drop_outliers(component, &nodes);
+    }
+    join(&mut grown, &nodes, detections, grey, options);
+    grown.retain(|component| component.places.len() >= 2);
+    orient(&mut grown, &nodes);
+    let mut used = vec![false; nodes.len()];
+    let pieces: Vec<Piece> = grown
+        .iter()
+        .map(|component| {
+            for node in component.places.values() {
+                used[*node] = true;
+            }
+            piece(component, &nodes, detections)
+        })
+        .collect();
+    let loose = (0..nodes.len()).filter(|node| !used[*node]).collect();
+    (pieces, loose)
+}
+
+/// The mutual nearest neighbours of every module in its four directions.
+fn find_links(nodes: &[Node]) -> Vec<[Link; 4]> {
+    let mut longest: Vec<f64> = nodes.iter().map(|node| node.sides[0].norm().max(node.sides[1].norm())).collect();
+    if longest.is_empty() {
+        return Vec::new();
+    }
+    let cell_px = (median(&mut longest) * REACH).max(1.0);
+    let key = |p: Vector2<f64>| ((p.x / cell_px).floor() as i64, (p.y / cell_px).floor() as i64);
+    let mut grid: HashMap<(i64, i64), Vec<usize>> = HashMap::new();
+    for (index, node) in nodes.iter().enumerate() {
+        grid.entry(key(node.center)).or_default().push(index);
+    }
+    let nearest: Vec<[Link; 4]> = nodes
+        .iter()
+        .enumerate()
+        .map(|(i, node)| {
+            let mut best: [(f64, Link); 4] = [(f64::INFINITY, None); 4];
+            let home = key(node.center);
+            for dx in -1..=1 {
+                for dy in -1..=1 {
+                    for &j in grid.get(&(home.0 + dx, home.1 + dy)).into_iter().flatten() {
+                        if i == j {
+                            continue;
+                        }
+                        let Some((d, turn, distance)) = neighbour(node, &nodes[j]) else { continue };
+                        if distance < best[d].0 {
+                            best[d] = (distance, Some((j, turn)));
+                        }
+                    }
+                }
+            }
+            best.map(|(_, link)| link)
+        })
+        .collect();
+    (0..nodes.len())
+        .map(|i| {
+            [0, 1, 2, 3].map(|d| {
+                nearest[i][d]
+                    .filter(|&(j, turn)| matches!(nearest[j][(d + 2 + turn) % 4], Some((back, _)) if back == i))
+            })
+        })
+        .collect()
+}
+
+/// In which direction of `node` the other one is its neighbour, the quarter turns between their frames, and the distance.
+fn neighbour(node: &Node, other: &Node) -> Option<(usize, usize, f64)> {
+    let turn = (0..4).max_by(|&s, &t| {
+        let cosine = |k: usize| node.sides[0].dot(&other.direction(k)) / other.direction(k).norm();
+        cosine(s).total_cmp(&cosine(t))
+    })?;
+    let (a, b) = ((node.sides[0] + other.direction(turn)) / 2.0, (node.sides[1] + other.direction(turn + 1)) / 2.0);
+    for (mine, theirs) in [(node.sides[0], other.direction(turn)), (node.sides[1], other.direction(turn + 1))] {
+        let ratio = theirs.norm() / mine.norm();
+        if !(0.65..1.55).contains(&ratio) || mine.dot(&theirs) < 0.85 * mine.norm() * theirs.norm() {
+            return None;
+        }
+    }
+    let offset = other.center - node.center;
+    let determinant = a.perp(&b);
+    if determinant.abs() < 1e-9 {
+        return None;
+    }
+    let (along_a, along_b) = (offset.perp(&b) / determinant, a.perp(&offset) / determinant);
+    let near = |main: f64, side: f64| (0.75..REACH).contains(&main.abs()) && side.abs() < 0.35;
+    let d = if near(along_a, along_b) {
+        if along_a > 0.0 { 0 } else { 2 }
+    } else if near(along_b, along_a) {
+        if along_b > 0.0 { 1 } else { 3 }
+    } else {
+        return None;
+    };
+    Some((d, turn, offset.norm()))
+}
+
+/// Connected components of the links, with lattice coordinates from a breadth-first walk.
+fn components(nodes: &[Node], links: &[[Link; 4]]) -> Vec<Component> {
+    const STEP: [(i32, i32); 4] = [(1, 0), (0, 1), (-1, 0), (0, -1)];
+    let mut seen = vec![false; nodes.len()];
+    let mut found = Vec::new();
+    for start in 0..nodes.len() {
+        if seen[start] {
+            continue;
+        }
+        seen[start] = true;
+        let mut component =
+            Component { places: BTreeMap::new(), turns: HashMap::from([(start, 0)]), bridges: Vec::new() };
+        component.places.insert((0, 0), start);
+        let mut queue = VecDeque::from([(start, (0, 0))]);
+        while let Some((i, place)) = queue.pop_front() {
+            let turn = component.turns[&i];
+            for own in 0..4 {
+                let Some((j, step_turn)) = links[i][own] else { continue };
+                if seen[j] {
+                    continue;
+                }
+                let (du, dv) = STEP[(own + 4 - turn) % 4];
+                let next = (place.0 + du, place.1 + dv);
+                if component.places.contains_key(&next) {
+                    continue;
+                }
+                seen[j] = true;
+                component.places.insert(next, j);
+                component.turns.insert(j, (turn + step_turn) % 4);
+                queue.push_back((j, next));
+            }
+        }
+        found.push(component);
+    }
+    found
+}
+
+/// Removes the links over bench gaps. The distance of neighbours is compared with a smooth model of the pitch in this
+/// component; all rows that cross between the same two columns decide together.
+fn cut_gaps(
+    component: &Component,
+    nodes: &[Node],
+    links: &mut [[Link; 4]],
+    detections: &ImageDetections,
+    grey: Option<&GrayImage>,
+    options: &LayoutOptions,
+) {
+    let sides = component.sides(nodes);
+    for axis in 0..2 {
+        // (transition, position across it) -> the two nodes.
+        let mut crossings: BTreeMap<(i32, i32), (usize, usize)> = BTreeMap::new();
+        for (&(col, row), &i) in &component.places {
+            let next = if axis == 0 { (col + 1, row) } else { (col, row + 1) };
+            if let Some(&j) = component.places.get(&next) {
+                let own = (axis + component.turns[&i]) % 4;
+                if matches!(links[i][own], Some((k, _)) if k == j) {
+                    crossings.insert(if axis == 0 { (col, row) } else { (row, col) }, (i, j));
+                }
+            }
+        }
+        if crossings.is_empty() {
+            continue;
+        }
+        let lengths: Vec<(Vector2<f64>, f64)> = crossings
+            .values()
+            .map(|&(i, j)| ((nodes[i].center + nodes[j].center) / 2.0, (nodes[j].center - nodes[i].center).norm()))
+            .collect();
+        let expected = pitch_model(&lengths, sides[axis].norm());
+        let scale = sides[0].norm().min(sides[1].norm());
+        let excess: Vec<f64> =
+            lengths.iter().zip(&expected).map(|((_, length), pitch)| (length - pitch) / scale).collect();
+        let keys: Vec<(i32, i32)> = crossings.keys().copied().collect();
+        let pairs: Vec<(usize, usize)> = crossings.values().copied().collect();
+        let mut start = 0;
+        while start < keys.len() {
+            let mut end = start + 1;
+            while end < keys.len() && keys[end].0 == keys[start].0 && keys[end].1 == keys[end - 1].1 + 1 {
+                end += 1;
+            }
+            let wide = median(&mut excess[start..end].to_vec());
+            let mut gap = wide > options.gap_threshold;
+            if let Some(grey) = grey.filter(|_| !gap && wide > 0.5 * options.gap_threshold) {
+                // Between a seam and a gap by its width: the ground decides (histograms of the transitions, Fig. 8).
+                let quads = |(i, j): (usize, usize)| (detections.detections[i].quad, detections.detections[j].quad);
+                let usual: Vec<(Quad, Quad)> =
+                    (0..pairs.len()).filter(|k| excess[*k].abs() < 0.03).take(40).map(|k| quads(pairs[k])).collect();
+                let here: Vec<(Quad, Quad)> = (start..end).map(|k| quads(pairs[k])).collect();
+                gap = transition::is_gap(grey, &here, &usual);
+            }
+            if gap {
+                for &(i, j) in &pairs[start..end] {
+                    for (from, to) in [(i, j), (j, i)] {
+                        for link in &mut links[from] {
+                            if matches!(link, Some((k, _)) if *k == to) {
+                                *link = None;
+                            }
+                        }
+                    }
+                }
+            }
+            start = end;
+        }
+    }
+}
+
+/// The expected distance at each link: the logarithm of the length is fitted as an affine function of the position, gaps
+/// left out as outliers. Few links give their lower median, but never less than the module's own side.
+fn pitch_model(lengths: &[(Vector2<f64>, f64)], side_px: f64) -> Vec<f64> {
+    let mut sorted: Vec<f64> = lengths.iter().map(|(_, length)| *length).collect();
+    sorted.sort_by(f64::total_cmp);
+    let lower = sorted[(sorted.len() - 1) * 2 / 5].min(side_px * 1.12).max(side_px * 0.95);
+    if lengths.len() < 8 {
+        return vec![lower; lengths.len()];
+    }
+    let origin = lengths.iter().map(|(at, _)| at).sum::<Vector2<f64>>() / lengths.len() as f64;
+    let spread = lengths.iter().map(|(at, _)| (at - origin).norm()).fold(1.0, f64::max);
+    let mut model = nalgebra::Vector3::new(lower.ln(), 0.0, 0.0);
+    let value = |model: &nalgebra::Vector3<f64>, at: &Vector2<f64>| {
+        let p = (at - origin) / spread;
+        model.x + model.y * p.x + model.z * p.y
+    };
+    let mut cut = 0.08;
+    for _ in 0..6 {
+        let mut normal = nalgebra::Matrix3::from_diagonal_element(1e-6);
+        normal += nalgebra::Matrix3::from_diagonal(&nalgebra::Vector3::new(0.0, 0.05, 0.05));
+        let mut right = nalgebra::Vector3::zeros();
+        for (at, length) in lengths {
+            let t = (length.ln() - value(&model, at)) / cut;
+            if t.abs() >= 1.0 {
+                continue;
+            }
+            let weight = (1.0 - t * t).powi(2);
+            let p = (at - origin) / spread;
+            let row = nalgebra::Vector3::new(1.0, p.x, p.y);
+            normal += weight * row * row.transpose();
+            right += weight * length.ln() * row;
+        }
+        match normal.cholesky() {
+            Some(cholesky) => model = cholesky.solve(&right),
+            None => break,
+        }
+        cut = 0.06;
+    }
+    lengths.iter().map(|(at, _)| value(&model, at).exp()).collect()
+}
+
+/// Takes out modules that stand off the lattice of their component.
+fn drop_outliers(component: &mut Component, nodes: &[Node]) {
+    if component.places.len() < 6 {
+        return;
+    }
+    let map = component.map(nodes);
+    let out: Vec<(i32, i32)> = component
+        .places
+        .iter()
+        .filter(|((col, row), node)| {
+            let [u, v] = map.pitch(f64::from(*col), f64::from(*row));
+            (map.pixel(f64::from(*col), f64::from(*row)) - nodes[**node].center).norm()
+                > INLIER * u.norm().min(v.norm())
+        })
+        .map(|(place, _)| *place)
+        .collect();
+    for place in out {
+        component.places.remove(&place);
+    }
+}
+
+/// Joins components that stand in one lattice: what a broken link or missing modules (equation 3) tore apart.
+fn join(
+    grown: &mut Vec<Component>,
+    nodes: &[Node],
+    detections: &ImageDetections,
+    grey: Option<&GrayImage>,
+    options: &LayoutOptions,
+) {
+    grown.sort_by_key(|component| std::cmp::Reverse(component.places.len()));
+    let mut index = 0;
+    while index < grown.len() {
+        if grown[index].places.len() < 2 {
+            break;
+        }
+        let mut map = grown[index].map(nodes);
+        let mut other = index + 1;
+        while other < grown.len() {
+            let joined = attachment(&grown[index], &map, &grown[other], nodes, options).filter(|join| {
+                join.missing == 0 || bridge_is_sound(join, &grown[index], &map, grey, detections, nodes)
+            });
+            let Some(attach) = joined else {
+                other += 1;
+                continue;
+            };
+            let part = grown.remove(other);
+            let base = &mut grown[index];
+            for ((col, row), node) in &part.places {
+                let (u, v) = turned(*col, *row, attach.turn);
+                base.places.insert((u + attach.shift.0, v + attach.shift.1), *node);
+                base.turns.insert(*node, (part.turns[node] + attach.turn) % 4);
+            }
+            if attach.missing > 0 {
+                base.bridges.push(attach.bridge);
+            }
+            map = base.map(nodes);
+            // What failed before may fit the longer lattice.
+            other = index + 1;
+        }
+        index += 1;
+    }
+}
+
+/// Lattice coordinates in a frame turned by quarter turns.
+fn turned(col: i32, row: i32, turn: usize) -> (i32, i32) {
+    // A node's direction d is the component's direction d - turn, so a part turned by `turn` steps its own +u along
+    // direction `4 - turn` of the base.
+    match (4 - turn) % 4 {
+        0 => (col, row),
+        1 => (-row, col),
+        2 => (-col, -row),
+        _ => (row, -col),
+    }
+}
+
+struct Attachment {
+    shift: (i32, i32),
+    turn: usize,
+    /// Columns without any detection between the two.
+    missing: i32,
+    /// Column of the base after which they are missing.
+    bridge: i32,
+}
+
+/// How `part` stands in the lattice of `base`, if it does.
+fn attachment(
+    base: &Component,
+    map: &LatticeMap,
+    part: &Component,
+    nodes: &[Node],
+    options: &LayoutOptions,
+) -> Option<Attachment> {
+    let base_sides = base.sides(nodes);
+    let part_sides = part.sides(nodes);
+    let directions = [part_sides[0], part_sides[1], -part_sides[0], -part_sides[1]];
+    let turn = (0..4).max_by(|&s, &t| {
+        let cosine = |k: usize| base_sides[0].dot(&directions[k]) / directions[k].norm();
+        cosine(s).total_cmp(&cosine(t))
+    })?;
+    for (mine, theirs) in [(base_sides[0], directions[turn]), (base_sides[1], directions[(turn + 1) % 4])] {
+        if !(0.8..1.25).contains(&(theirs.norm() / mine.norm()))
+            || mine.dot(&theirs) < 0.95 * mine.norm() * theirs.norm()
+        {
+            return None;
+        }
+    }
+    let (col_low, col_high) = base.col_range();
+    let (row_low, row_high) = base.row_range();
+    let reach = f64::from(options.max_missing + 2);
+    let mut shift = None;
+    for ((col, row), node) in &part.places {
+        let at = map.coordinate(nodes[*node].center)?;
+        let outside = (f64::from(col_low) - at.x).max(at.x - f64::from(col_high)).max(0.0);
+        // The lattice is known where it was fitted; beyond it, less and less.
+        let tolerance = 0.15 + 0.02 * outside.min(10.0);
+        let (u, v) = turned(*col, *row, turn);
+        let near = (at.x.round() as i32 - u, at.y.round() as i32 - v);
+        if shift.is_none() && outside > reach {
+            return None;
+        }
+        let shift = *shift.get_or_insert(near);
+        let place = (u + shift.0, v + shift.1);
+        if base.places.contains_key(&place) {
+            return None;
+        }
+        let (off_col, off_row) = (at.x - f64::from(place.0), at.y - f64::from(place.1));
+        if outside < reach && (off_col.abs() > tolerance || off_row.abs() > 0.25) {
+            return None;
+        }
+    }
+    let shift = shift?;
+    let places: Vec<(i32, i32)> = part
+        .places
+        .keys()
+        .map(|(col, row)| turned(*col, *row, turn))
+        .map(|(u, v)| (u + shift.0, v + shift.1))
+        .collect();
+    let (part_low, part_high) = range(places.iter().map(|place| place.0));
+    let (part_row_low, part_row_high) = range(places.iter().map(|place| place.1));
+    // A whole row further out than the next one is another bench.
+    if part_row_low > row_high + 1 || part_row_high < row_low - 1 {
+        return None;
+    }
+    let rows_shared = part_row_low <= row_high && part_row_high >= row_low;
+    let (missing, bridge) = if part_low > col_high {
+        (part_low - col_high - 1, col_high)
+    } else if part_high < col_low {
+        (col_low - part_high - 1, part_high)
+    } else {
+        (0, 0)
+    };
+    if missing > options.max_missing || (missing > 0 && !rows_shared) {
+        return None;
+    }
+    // Beside each other and not linked: only the same columns say that they are rows of one bench.
+    if !rows_shared && (part_low < col_low - 1 || part_high > col_high + 1) {
+        return None;
+    }
+    Some(Attachment { shift, turn, missing, bridge })
+}
+
+/// Whether missing columns are missed modules rather than a gap that happens to be a whole number of modules wide. With
+/// an image, the place must look like a module or be washed out by glare; without one, a single row may miss one or two.
+fn bridge_is_sound(
+    attach: &Attachment,
+    base: &Component,
+    map: &LatticeMap,
+    grey: Option<&GrayImage>,
+    detections: &ImageDetections,
+    nodes: &[Node],
+) -> bool {
+    let (row_low, row_high) = base.row_range();
+    let Some(grey) = grey else {
+        return row_low == row_high && attach.missing <= 2;
+    };
+    let [u, v] = base.sides(nodes);
+    let examples: Vec<Quad> = base.places.values().take(40).map(|node| detections.detections[*node].quad).collect();
+    let places: Vec<Quad> = (1..=attach.missing)
+        .flat_map(|k| (row_low..=row_high).map(move |row| (attach.bridge + k, row)))
+        .map(|(col, row)| Quad::from_center(map.pixel(f64::from(col), f64::from(row)), u / 2.0, v / 2.0))
+        .collect();
+    transition::looks_like_modules(grey, &places, &examples)
+}
+
+/// Turns every component so that its columns run along the row: a long one by its own shape, a short one as the nearest
+/// long one of the same kind. Columns then count to the right, rows downwards on the screen.
+fn orient(grown: &mut [Component], nodes: &[Node]) {
+    let extent = |component: &Component| {
+        let (cols, rows) = (component.col_range(), component.row_range());
+        (cols.1 - cols.0 + 1, rows.1 - rows.0 + 1)
+    };
+    let center = |component: &Component| {
+        component.places.values().map(|node| nodes[*node].center).sum::<Vector2<f64>>() / component.places.len() as f64
+    };
+    // (centre, unit vector along the row, weight) of those whose shape tells.
+    let long: Vec<(Vector2<f64>, Vector2<f64>, f64)> = grown
+        .iter()
+        .filter_map(|component| {
+            let (cols, rows) = extent(component);
+            let [u, v] = component.sides(nodes);
+            let weight = component.places.len() as f64;
+            if f64::from(cols) >= 2.0 * f64::from(rows) && cols >= 4 {
+                Some((center(component), u.normalize(), weight))
+            } else if f64::from(rows) >= 2.0 * f64::from(cols) && rows >= 4 {
+                Some((center(component), v.normalize(), weight))
+            } else {
+                None
+            }
+        })
+        .collect();
+    for component in grown.iter_mut() {
+        let (cols, rows) = extent(component);
+        let [u, v] = component.sides(nodes);
+        let here = center(component);
+        let clear = f64::from(cols.max(rows)) >= 2.0 * f64::from(cols.min(rows)) && cols.max(rows) >= 4;
+        let along_u = if clear {
+            cols >= rows
+        } else {
+            let size = u.norm().max(v.norm());
+            let vote: f64 = long
+                .iter()
+                .map(|(at, along, weight)| {
+                    let distance = (at - here).norm() / size;
+                    let agreement = u.normalize().dot(along).abs() - v.normalize().dot(along).abs();
+                    agreement * weight / (25.0 + distance * distance)
+                })
+                .sum();
+            if vote.abs() > 1e-6 { vote > 0.0 } else { cols >= rows }
+        };
+        let along = if along_u { u } else { v };
+        let forward = if along.x.abs() > 0.2 * along.y.abs() { along.x > 0.0 } else { along.y > 0.0 };
+        let turn = match (along_u, forward) {
+            (true, true) => 0,
+            (true, false) => 2,
+            (false, true) => 1,
+            (false, false) => 3,
+        };
+        if turn != 0 {
+            let places = std::mem::take(&mut component.places);
+            component.places = places
+                .into_iter()
+                .map(|((col, row), node)| {
+                    let place = match turn {
+                        1 => (row, -col),
+                        2 => (-col, -row),
+                        _ => (-row, col),
+                    };
+                    (place, node)
+                })
+                .collect();
+            for node_turn in component.turns.values_mut() {
+                *node_turn = (*node_turn + turn) % 4;
+            }
+            component.bridges.clear();
+        }
+        // Columns without any detection are bridges, whatever joined them.
+        let (low, high) = component.col_range();
+        component.bridges = (low..high)
+            .filter(|col| {
+                component.places.keys().any(|place| place.0 == *col)
+                    && !component.places.keys().any(|place| place.0 == *col + 1)
+            })
+            .collect();
+    }
+}
+
+/// The finished piece: coordinates from 0, hypotheses in the holes, and what bounds it.
+fn piece(component: &Component, nodes: &[Node], detections: &ImageDetections) -> Piece {
+    let (col_low, col_high) = component.col_range();
+    let (row_low, row_high) = component.row_range();
+    let (cols, rows) = (col_high - col_low + 1, row_high - row_low + 1);
+    let mut normalised = Component { places: BTreeMap::new(), turns: component.turns.clone(), bridges: Vec::new() };
+    for ((col, row), node) in &component.places {
+        normalised.places.insert((col - col_low, row - row_low), *node);
+    }
+    let map = normalised.map(nodes);
+    let [u, v] = normalised.sides(nodes);
+    let middle = map.pitch(f64::from(cols - 1) / 2.0, f64::from(rows - 1) / 2.0);
+    let (fill_u, fill_v) = ((u.norm() / middle[0].norm()).min(1.0), (v.norm() / middle[1].norm()).min(1.0));
+    let quad_at = |col: i32, row: i32| {
+        let (c, r) = (f64::from(col), f64::from(row));
+        let [du, dv] = map.pitch(c, r);
+        Quad::from_center(map.pixel(c, r), du * fill_u / 2.0, dv * fill_v / 2.0)
+    };
+    let margin = (0.15 * u.norm().min(v.norm())).max(4.0);
+    let (width, height) = (f64::from(detections.width_px), f64::from(detections.height_px));
+    let inside = |quad: &Quad| {
+        quad.corners
+            .iter()
+            .all(|c| c.x > margin && c.y > margin && c.x < width - 1.0 - margin && c.y < height - 1.0 - margin)
+    };
+    let mut cells = Vec::new();
+    for row in 0..rows {
+        for col in 0..cols {
+            if let Some(node) = normalised.places.get(&(col, row)) {
+                cells.push(Cell { row, col, quad: detections.detections[*node].quad, detection: Some(*node) });
+            } else {
+                let quad = quad_at(col, row);
+                if inside(&quad) {
+                    cells.push(Cell { row, col, quad, detection: None });
+                }
+            }
+        }
+    }
+    // A side is closed if, past most of the modules that stand there, one more would be seen.
+    let side = |modules: Vec<(i32, i32)>, step: (i32, i32)| {
+        let seen = modules.iter().filter(|(col, row)| inside(&quad_at(col + step.0, row + step.1))).count();
+        if 2 * seen > modules.len() { End::Closed } else { End::Cut }
+    };
+    let west = side((0..rows).map(|row| (0, row)).collect(), (-1, 0));
+    let east = side((0..rows).map(|row| (cols - 1, row)).collect(), (1, 0));
+    let north = side((0..cols).map(|col| (col, 0)).collect(), (0, -1));
+    let south = side((0..cols).map(|col| (col, rows - 1)).collect(), (0, 1));
+    let bridges = component.bridges.iter().map(|col| col - col_low).collect();
+    Piece { rows, cols, cells, map, west, east, north, south, bridges }
+}

@@ -1,0 +1,316 @@
+//! The refined structure becomes the plant model: labels, identifiers, corners on the ground.
+
+use super::ids::{BenchId, LineId, ModuleId, PlantId, SectorId};
+use super::model::{Bench, Line, Module, ModuleStatus, PlantModel, Sector, Warning};
+use crate::fusion::{Fused, View};
+use crate::geometry::GeodeticReference;
+use crate::refinement::RefinedBench;
+use nalgebra::{Vector2, Vector3};
+use rstar::RTree;
+use rstar::primitives::GeomWithData;
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+
+/// What the model is of.
+#[derive(Debug, Clone, Copy)]
+pub struct Identity<'a> {
+    pub plant: PlantId,
+    pub plant_name: &'a str,
+    pub survey: &'a str,
+    /// The newest model so far: its identifiers live on.
+    pub previous: Option<&'a PlantModel>,
+}
+
+/// Assembles the model. Identifiers of `identity.previous` are kept by everything that is found again; what is new gets
+/// the next ones.
+pub fn assemble(
+    views: &[View<'_>],
+    fused: &Fused,
+    refined: &[RefinedBench],
+    reference: GeodeticReference,
+    vertical_datum: String,
+    identity: &Identity<'_>,
+    mut warnings: Vec<Warning>,
+) -> PlantModel {
+    let mut drafts: Vec<Draft> = Vec::new();
+    for (line_index, line) in fused.lines.iter().enumerate() {
+        for &bench_index in &line.benches {
+            let (bench, refined) = (&fused.benches[bench_index], &refined[bench_index]);
+            for (module, position) in bench.modules.iter().zip(&refined.modules) {
+                drafts.push(Draft { line_index, bench_index, module, position, bench: refined });
+            }
+        }
+    }
+    let mut registry = Registry::new(identity.plant, reference, identity.previous, &drafts);
+    let mut model = PlantModel {
+        plant: identity.plant,
+        plant_name: identity.plant_name.to_owned(),
+        version: identity.previous.map_or(1, |previous| previous.version + 1),
+        survey: identity.survey.to_owned(),
+        reference,
+        vertical_datum,
+        lines: Vec::new(),
+        benches: Vec::new(),
+        sectors: Vec::new(),
+        modules: Vec::with_capacity(drafts.len()),
+        warnings: Vec::new(),
+        serials: [0; 4],
+    };
+    let mut next_draft = 0;
+    for (line_index, line) in fused.lines.iter().enumerate() {
+        let line_label = format!("L{:02}", line_index + 1);
+        let line_id = registry.line(line_index);
+        model.lines.push(Line { id: line_id, label: line_label.clone(), index: line_index as u32 + 1 });
+        for (bench_in_line, &bench_index) in line.benches.iter().enumerate() {
+            let bench = &fused.benches[bench_index];
+            let bench_label = format!("{line_label}-B{:02}", bench_in_line + 1);
+            let bench_id = registry.bench(bench_index);
+            model.benches.push(Bench {
+                id: bench_id,
+                label: bench_label.clone(),
+                line: line_id,
+                index: bench_in_line as u32 + 1,
+                rows: bench.rows as u32,
+                columns: bench.cols as u32,
+                open_ended: bench.open_ended,
+                confidence: bench.confidence,
+            });
+            let mut sector_ids = BTreeMap::new();
+            for row in 0..bench.rows {
+                if bench.modules.iter().any(|module| module.row == row) {
+                    let id = registry.sector(bench_index, row);
+                    sector_ids.insert(row, id);
+                    model.sectors.push(Sector {
+                        id,
+                        label: format!("{bench_label}-R{}", row + 1),
+                        line: line_id,
+                        bench: bench_id,
+                        row: row as u32 + 1,
+                    });
+                }
+            }
+            for module in &bench.modules {
+                let draft = &drafts[next_draft];
+                let images: BTreeSet<String> =
+                    module.observations.iter().map(|o| views[o.view].shot.name.clone()).collect();
+                model.modules.push(Module {
+                    id: registry.module(next_draft),
+                    label: format!("{bench_label}-R{}-{:03}", module.row + 1, module.col + 1),
+                    line: line_id,
+                    bench: bench_id,
+                    sector: sector_ids[&module.row],
+                    row: module.row as u32 + 1,
+                    number: module.col as u32 + 1,
+                    corners_enu_m: draft.corners(),
+                    center_enu_m: draft.position.center_m,
+                    normal_enu: draft.bench.normal(),
+                    width_m: draft.bench.module_size_m[0],
+                    height_m: draft.bench.module_size_m[1],
+                    sigma_enu_m: draft.position.sigma_m,
+                    images: images.into_iter().collect(),
+                    status: if module.inferred_in.is_empty() {
+                        ModuleStatus::Detected
+                    } else {
+                        ModuleStatus::Confirmed
+                    },
+                });
+                next_draft += 1;
+            }
+        }
+    }
+    warnings.extend(
+        fused.doubts.iter().map(|doubt| Warning::new(doubt.code, doubt.message.clone(), doubt.images.iter().cloned())),
+    );
+    warnings.sort();
+    warnings.dedup();
+    model.warnings = warnings;
+    model.serials = registry.serials;
+    model
+}
+
+/// A module on its way into the model.
+struct Draft<'a> {
+    line_index: usize,
+    bench_index: usize,
+    module: &'a crate::fusion::FusedModule,
+    position: &'a crate::refinement::RefinedModule,
+    bench: &'a RefinedBench,
+}
+
+impl Draft<'_> {
+    /// South-west, south-east, north-east, north-west.
+    fn corners(&self) -> [Vector3<f64>; 4] {
+        let half_along = self.bench.along * (self.bench.module_size_m[0] / 2.0);
+        let half_down = self.bench.across * (self.bench.module_size_m[1] / 2.0);
+        let center = self.position.center_m;
+        [
+            center - half_along + half_down,
+            center + half_along + half_down,
+            center + half_along - half_down,
+            center - half_along - half_down,
+        ]
+    }
+}
+
+/// Gives identifiers: the old ones to what is found again, new ones to the rest.
+struct Registry {
+    plant: PlantId,
+    serials: [u64; 4],
+    lines: HashMap<usize, LineId>,
+    benches: HashMap<usize, BenchId>,
+    sectors: HashMap<(usize, i32), SectorId>,
+    modules: HashMap<usize, ModuleId>,
+}
+
+impl Registry {
+    fn new(plant: PlantId, reference: GeodeticReference, previous: Option<&PlantModel>, drafts: &[Draft<'_>]) -> Self {
+        let mut registry = Self {
+            plant,
+            serials: previous.map_or([0; 4], |model| model.serials),
+            lines: HashMap::new(),
+            benches: HashMap::new(),
+            sectors: HashMap::new(),
+            modules: HashMap::new(),
+        };
+        let Some(previous) = previous else { return registry };
+        let pairs = found_again(reference, previous, drafts);
+        for &(draft, old) in &pairs {
+            registry.modules.insert(draft, previous.modules[old].id);
+        }
+        let of_pairs = || pairs.iter().map(|&(draft, old)| (&drafts[draft], &previous.modules[old]));
+        registry.lines = elect(of_pairs().map(|(draft, old)| (draft.line_index, old.line)));
+        registry.benches = elect(of_pairs().map(|(draft, old)| (draft.bench_index, old.bench)));
+        registry.sectors = elect(of_pairs().map(|(draft, old)| ((draft.bench_index, draft.module.row), old.sector)));
+        registry
+    }
+
+    fn next(&mut self, kind: usize) -> u64 {
+        self.serials[kind] += 1;
+        self.serials[kind]
+    }
+
+    fn line(&mut self, index: usize) -> LineId {
+        if let Some(id) = self.lines.get(&index) {
+            return *id;
+        }
+        LineId::from_serial(self.plant, self.next(0))
+    }
+
+    fn bench(&mut self, index: usize) -> BenchId {
+        if let Some(id) = self.benches.get(&index) {
+            return *id;
+        }
+        BenchId::from_serial(self.plant, self.next(1))
+    }
+
+    fn sector(&mut self, bench: usize, row: i32) -> SectorId {
+        if let Some(id) = self.sectors.get(&(bench, row)) {
+            return *id;
+        }
+        SectorId::from_serial(self.plant, self.next(2))
+    }
+
+    fn module(&mut self, draft: usize) -> ModuleId {
+        if let Some(id) = self.modules.get(&draft) {
+            return *id;
+        }
+        ModuleId::from_serial(self.plant, self.next(3))
+    }
+}
+
+/// Each new group takes the old identifier that most of its modules had; of two that want the same, the one with more.
+fn elect<K: Copy + Ord + std::hash::Hash, V: Copy + Ord>(pairs: impl Iterator<Item = (K, V)>) -> HashMap<K, V> {
+    let mut votes: BTreeMap<(K, V), usize> = BTreeMap::new();
+    for pair in pairs {
+        *votes.entry(pair).or_default() += 1;
+    }
+    let mut ranked: Vec<((K, V), usize)> = votes.into_iter().collect();
+    ranked.sort_by(|a, b| b.1.cmp(&a.1).then(a.0.cmp(&b.0)));
+    let mut elected = HashMap::new();
+    let mut taken = BTreeSet::new();
+    for ((key, value), _) in ranked {
+        if !elected.contains_key(&key) && taken.insert(value) {
+            elected.insert(key, value);
+        }
+    }
+    elected
+}
+
+/// Pairs of (draft, old module) that are the same module. GNSS moves one survey against the next by metres, more than a
+/// module: the common shift is found first, by vote among benches of the same shape.
+fn found_again(reference: GeodeticReference, previous: &PlantModel, drafts: &[Draft<'_>]) -> Vec<(usize, usize)> {
+    const REACH_M: f64 = 12.0;
+    const BIN_M: f64 = 0.5;
+    let old_centers: Vec<Vector3<f64>> = previous
+        .modules
+        .iter()
+        .map(|module| reference.enu_from_lla(previous.reference.lla_from_enu(module.center_enu_m)))
+        .collect();
+    // (rows, columns, modules, middle) of each bench.
+    type Shape = (u32, u32, usize);
+    let mut old: BTreeMap<BenchId, (Vector3<f64>, usize)> = BTreeMap::new();
+    for (module, center) in previous.modules.iter().zip(&old_centers) {
+        let entry = old.entry(module.bench).or_insert((Vector3::zeros(), 0));
+        *entry = (entry.0 + center, entry.1 + 1);
+    }
+    let mut by_shape: BTreeMap<Shape, Vec<Vector2<f64>>> = BTreeMap::new();
+    for bench in &previous.benches {
+        if let Some((sum, count)) = old.get(&bench.id) {
+            let middle = (sum / *count as f64).xy();
+            by_shape.entry((bench.rows, bench.columns, *count)).or_default().push(middle);
+        }
+    }
+    let mut new: BTreeMap<usize, (Vector3<f64>, usize, i32, i32)> = BTreeMap::new();
+    for draft in drafts {
+        let entry = new.entry(draft.bench_index).or_insert((Vector3::zeros(), 0, 0, 0));
+        *entry = (
+            entry.0 + draft.position.center_m,
+            entry.1 + 1,
+            entry.2.max(draft.module.row + 1),
+            entry.3.max(draft.module.col + 1),
+        );
+    }
+    let mut votes: BTreeMap<(i64, i64), (usize, Vector2<f64>)> = BTreeMap::new();
+    for (sum, count, rows, cols) in new.values() {
+        let middle = (sum / *count as f64).xy();
+        for other in by_shape.get(&(*rows as u32, *cols as u32, *count)).into_iter().flatten() {
+            let shift = other - middle;
+            if shift.norm() > REACH_M {
+                continue;
+            }
+            // Half-overlapping bins, so that a shift near a border is not torn apart.
+            for (dx, dy) in [(0.0, 0.0), (0.5, 0.0), (0.0, 0.5), (0.5, 0.5)] {
+                let key = (
+                    ((shift.x / BIN_M + dx).floor() as i64) * 2 + i64::from(dx > 0.0),
+                    ((shift.y / BIN_M + dy).floor() as i64) * 2 + i64::from(dy > 0.0),
+                );
+                let vote = votes.entry(key).or_insert((0, Vector2::zeros()));
+                *vote = (vote.0 + 1, vote.1 + shift);
+            }
+        }
+    }
+    let shift = votes
+        .values()
+        .map(|(count, sum)| (*count, sum / *count as f64))
+        .max_by(|a, b| a.0.cmp(&b.0).then(b.1.norm().total_cmp(&a.1.norm())))
+        .map_or(Vector2::zeros(), |(_, shift)| shift);
+    let tree = RTree::bulk_load(
+        old_centers.iter().enumerate().map(|(index, c)| GeomWithData::new([c.x, c.y], index)).collect(),
+    );
+    let mut candidates: Vec<(f64, usize, usize)> = Vec::new();
+    for (index, draft) in drafts.iter().enumerate() {
+        let at = draft.position.center_m.xy() + shift;
+        if let Some(nearest) = tree.nearest_neighbor([at.x, at.y]) {
+            let distance = (Vector2::from(*nearest.geom()) - at).norm();
+            let size = draft.bench.module_size_m;
+            if distance < 0.5 * size[0].min(size[1]) {
+                candidates.push((distance, index, nearest.data));
+            }
+        }
+    }
+    candidates.sort_by(|a, b| a.0.total_cmp(&b.0).then((a.1, a.2).cmp(&(b.1, b.2))));
+    let mut taken = BTreeSet::new();
+    let mut pairs: Vec<(usize, usize)> =
+        candidates.into_iter().filter(|(_, _, old)| taken.insert(*old)).map(|(_, draft, old)| (draft, old)).collect();
+    pairs.sort_unstable();
+    pairs
+}

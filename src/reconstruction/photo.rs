@@ -1,0 +1,284 @@
+//! Photos: checked by their header before anything is decoded, decoded whole or refused, undistorted where the file is
+//! as the lens drew it.
+
+use crate::geometry::Camera;
+use image::{ImageFormat, ImageReader, RgbImage};
+use nalgebra::Vector2;
+use rayon::prelude::*;
+use std::fs::File;
+use std::io::{BufRead, BufReader, Read, Seek};
+use std::path::{Path, PathBuf};
+
+/// Default for the most pixels that an image may have: 100 megapixels.
+pub const DEFAULT_MAX_PIXELS: u64 = 100_000_000;
+
+/// Why a photo is refused. Each sentence names the file and says what to do.
+#[derive(Debug, thiserror::Error)]
+pub enum PhotoError {
+    #[error("{name} cannot be read: {source}")]
+    Unreadable { name: String, source: std::io::Error },
+    #[error("{name} is no image that can be read (JPEG, PNG or TIFF): {what}; copy it from the camera again")]
+    NotAnImage { name: String, what: String },
+    #[error("{name} is named as {named} but holds {held}: name it by what it is, or export it again")]
+    WrongName { name: String, named: &'static str, held: &'static str },
+    #[error(
+        "{name} is {width} x {height} pixels, more than the {limit} pixels allowed: scale it down, or raise the limit"
+    )]
+    TooLarge { name: String, width: u32, height: u32, limit: u64 },
+    #[error("{name} is cut short: its image data ends early; copy it from the camera again")]
+    Truncated { name: String },
+}
+
+impl PhotoError {
+    /// A stable word for programs.
+    pub fn code(&self) -> &'static str {
+        match self {
+            Self::Unreadable { .. } => "file_unreadable",
+            Self::NotAnImage { .. } => "image_unreadable",
+            Self::WrongName { .. } => "image_format_mismatch",
+            Self::TooLarge { .. } => "image_too_large",
+            Self::Truncated { .. } => "image_truncated",
+        }
+    }
+}
+
+/// What the header of a photo says.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct PhotoHeader {
+    pub width_px: u32,
+    pub height_px: u32,
+    pub format: ImageFormat,
+}
+
+fn format_name(format: ImageFormat) -> &'static str {
+    match format {
+        ImageFormat::Jpeg => "JPEG",
+        ImageFormat::Png => "PNG",
+        ImageFormat::Tiff => "TIFF",
+        _ => "another format",
+    }
+}
+
+/// Checks a photo without decoding it: its format by content and by `name` (what the user calls it), its size against
+/// `max_pixels`, and that a JPEG's image data has an end.
+pub fn inspect(path: &Path, name: &str, max_pixels: u64) -> Result<PhotoHeader, PhotoError> {
+    let unreadable = |source| PhotoError::Unreadable { name: name.to_owned(), source };
+    let reader = ImageReader::open(path).map_err(unreadable)?.with_guessed_format().map_err(unreadable)?;
+    let not_an_image = |what: String| PhotoError::NotAnImage { name: name.to_owned(), what };
+    // `open` starts from the path's extension; only the content counts here.
+    let format = {
+        let mut start = Vec::new();
+        File::open(path).map_err(unreadable)?.take(64).read_to_end(&mut start).map_err(unreadable)?;
+        image::guess_format(&start).map_err(|_| not_an_image("its first bytes are of no known format".to_owned()))?
+    };
+    if !matches!(format, ImageFormat::Jpeg | ImageFormat::Png | ImageFormat::Tiff) {
+        return Err(not_an_image("its format is another".to_owned()));
+    }
+    let extension = Path::new(name).extension().and_then(|e| e.to_str()).unwrap_or("").to_ascii_lowercase();
+    let named = match extension.as_str() {
+        "jpg" | "jpeg" => Some(ImageFormat::Jpeg),
+        "png" => Some(ImageFormat::Png),
+        "tif" | "tiff" => Some(ImageFormat::Tiff),
+        _ => None,
+    };
+    if let Some(named) = named.filter(|named| *named != format) {
+        return Err(PhotoError::WrongName {
+            name: name.to_owned(),
+            named: format_name(named),
+            held: format_name(format),
+        });
+    }
+    let (width, height) = reader.into_dimensions().map_err(|error| not_an_image(error.to_string()))?;
+    if u64::from(width) * u64::from(height) > max_pixels {
+        return Err(PhotoError::TooLarge { name: name.to_owned(), width, height, limit: max_pixels });
+    }
+    if width == 0 || height == 0 {
+        return Err(not_an_image("it has no pixels".to_owned()));
+    }
+    if format == ImageFormat::Jpeg {
+        let file = BufReader::with_capacity(1 << 18, File::open(path).map_err(unreadable)?);
+        if !jpeg_has_an_end(file).map_err(unreadable)? {
+            return Err(PhotoError::Truncated { name: name.to_owned() });
+        }
+    }
+    Ok(PhotoHeader { width_px: width, height_px: height, format })
+}
+
+/// Whether the image data of a JPEG runs to its end-of-image marker. Decoders fill what is missing with grey and say
+/// nothing, so this is looked for in the file: segments are skipped by their length (a thumbnail in one of them has an
+/// end of its own), and entropy-coded data cannot hold the marker by chance.
+fn jpeg_has_an_end(mut file: impl BufRead + Seek) -> std::io::Result<bool> {
+    let mut in_scan = false;
+    loop {
+        let mut byte = [0_u8];
+        if in_scan {
+            // Skip to the next 0xFF.
+            let skipped = file.fill_buf()?;
+            if skipped.is_empty() {
+                return Ok(false);
+            }
+            match skipped.iter().position(|b| *b == 0xFF) {
+                Some(at) => file.consume(at + 1),
+                None => {
+                    let all = skipped.len();
+                    file.consume(all);
+                    continue;
+                }
+            }
+        } else {
+            if file.read(&mut byte)? == 0 {
+                return Ok(false);
+            }
+            if byte[0] != 0xFF {
+                continue;
+            }
+        }
+        let mut marker = 0xFF;
+        while marker == 0xFF {
+            if file.read(&mut byte)? == 0 {
+                return Ok(false);
+            }
+            marker = byte[0];
+        }
+        match marker {
+            0xD9 => return Ok(true),
+            0x00 | 0x01 | 0xD0..=0xD8 => {}
+            _ => {
+                let mut length = [0_u8; 2];
+                if let Err(error) = file.read_exact(&mut length) {
+                    return if error.kind() == std::io::ErrorKind::UnexpectedEof { Ok(false) } else { Err(error) };
+                }
+                file.seek_relative(i64::from(u16::from_be_bytes(length)).saturating_sub(2))?;
+                in_scan = marker == 0xDA;
+            }
+        }
+    }
+}
+
+/// A photo on disk that belongs to a shot.
+#[derive(Debug, Clone)]
+pub struct Photo {
+    /// The shot's name.
+    pub shot: String,
+    pub path: PathBuf,
+    pub header: PhotoHeader,
+    /// The camera of the file as it is, distorted or not, at the file's size.
+    pub camera: Camera,
+}
+
+impl Photo {
+    /// The camera of what [`Photo::load`] gives: free of distortion.
+    pub fn undistorted_camera(&self) -> Camera {
+        self.camera.undistorted()
+    }
+
+    /// Decodes the photo and undistorts it where the file is as the lens drew it. H x W, 8-bit RGB.
+    ///
+    /// # Errors
+    /// Data that does not decode.
+    pub fn load(&self) -> Result<RgbImage, PhotoError> {
+        let name = self.path.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned());
+        let unreadable = |source| PhotoError::Unreadable { name: name.clone(), source };
+        let mut reader = ImageReader::new(BufReader::new(File::open(&self.path).map_err(unreadable)?));
+        reader.set_format(self.header.format);
+        let decoded = reader
+            .decode()
+            .map_err(|error| PhotoError::NotAnImage { name: name.clone(), what: error.to_string() })?
+            .into_rgb8();
+        if self.camera.is_undistorted() { Ok(decoded) } else { Ok(undistort(&decoded, &self.camera)) }
+    }
+}
+
+/// The image that the same camera without distortion would have taken: same size, focal length and principal point
+/// (OpenSfM's convention). Bilinear; black where the photo does not reach.
+pub fn undistort(photo: &RgbImage, camera: &Camera) -> RgbImage {
+    let target = camera.undistorted();
+    let (width, height) = photo.dimensions();
+    let source = photo.as_raw();
+    let stride = width as usize * 3;
+    let mut pixels = vec![0_u8; stride * height as usize];
+    // The lens is smooth: exact at every 8th column and in between interpolated, to well below 0.01 px.
+    const STEP: usize = 8;
+    pixels.par_chunks_mut(stride).enumerate().for_each(|(v, row)| {
+        let knot = |u: usize| {
+            let n = target.normalised_from_pixel(Vector2::new(u as f64, v as f64));
+            camera.pixel_from_normalised(n.x, n.y)
+        };
+        let mut left = knot(0);
+        for start in (0..width as usize).step_by(STEP) {
+            let right = knot(start + STEP);
+            for (offset, pixel) in row[start * 3..].chunks_exact_mut(3).take(STEP).enumerate() {
+                let at = left + (right - left) * (offset as f64 / STEP as f64);
+                let (x0, y0) = (at.x.floor(), at.y.floor());
+                if x0 < 0.0 || y0 < 0.0 || x0 + 1.0 >= f64::from(width) || y0 + 1.0 >= f64::from(height) {
+                    continue;
+                }
+                let (fx, fy) = ((at.x - x0) as f32, (at.y - y0) as f32);
+                let base = y0 as usize * stride + x0 as usize * 3;
+                for (channel, value) in pixel.iter_mut().enumerate() {
+                    let sample = |offset: usize| f32::from(source[base + offset + channel]);
+                    let top = sample(0) * (1.0 - fx) + sample(3) * fx;
+                    let bottom = sample(stride) * (1.0 - fx) + sample(stride + 3) * fx;
+                    *value = (top * (1.0 - fy) + bottom * fy + 0.5) as u8;
+                }
+            }
+            left = right;
+        }
+    });
+    RgbImage::from_raw(width, height, pixels).expect("the buffer was made for this size")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::camera::Lens;
+    use image::Rgb;
+
+    fn picture() -> RgbImage {
+        RgbImage::from_fn(160, 120, |x, y| Rgb([(x + y) as u8, (2 * x) as u8, (255 - y) as u8]))
+    }
+
+    #[test]
+    fn a_jpeg_cut_short_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.jpg");
+        picture().save(&path).unwrap();
+        let header = inspect(&path, "a.jpg", DEFAULT_MAX_PIXELS).unwrap();
+        assert_eq!((header.width_px, header.height_px), (160, 120));
+        let bytes = std::fs::read(&path).unwrap();
+        std::fs::write(&path, &bytes[..bytes.len() * 2 / 3]).unwrap();
+        assert!(matches!(inspect(&path, "a.jpg", DEFAULT_MAX_PIXELS), Err(PhotoError::Truncated { .. })));
+    }
+
+    #[test]
+    fn format_and_size_are_checked_by_the_header() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.png");
+        picture().save(&path).unwrap();
+        assert!(matches!(inspect(&path, "a.jpg", DEFAULT_MAX_PIXELS), Err(PhotoError::WrongName { .. })));
+        assert!(matches!(inspect(&path, "a.png", 1000), Err(PhotoError::TooLarge { .. })));
+        std::fs::write(&path, b"no image at all").unwrap();
+        assert!(matches!(inspect(&path, "a.png", 1000), Err(PhotoError::NotAnImage { .. })));
+    }
+
+    #[test]
+    fn undistortion_puts_a_mark_where_the_pinhole_camera_sees_it() {
+        let mut camera = Camera::pinhole(161, 121, 0.8);
+        camera.lens = Lens::Radial { k1: -0.1, k2: 0.01, k3: 0.0, p1: 0.0, p2: 0.0 };
+        let normalised = Vector2::new(0.4, 0.25);
+        let distorted = camera.pixel_from_normalised(normalised.x, normalised.y);
+        let photo = RgbImage::from_fn(161, 121, |x, y| {
+            let d = (Vector2::new(f64::from(x), f64::from(y)) - distorted).norm();
+            Rgb([(255.0 * (-d * d / 8.0).exp()) as u8; 3])
+        });
+        let flat = undistort(&photo, &camera);
+        let (mut sum, mut weight) = (Vector2::zeros(), 0.0);
+        for (x, y, p) in flat.enumerate_pixels() {
+            let w = f64::from(p.0[0]);
+            sum += Vector2::new(f64::from(x), f64::from(y)) * w;
+            weight += w;
+        }
+        let expected = camera.undistorted().pixel_from_normalised(normalised.x, normalised.y);
+        assert!((sum / weight - expected).norm() < 0.05);
+    }
+}
