@@ -23,7 +23,7 @@ def crop(photo: Photo, size: int, rng: Rng, short_side: tuple[float, float]) -> 
     h, w = photo.image.shape[:2]
     want = np.exp(rng.uniform(np.log(short_side[0]), np.log(short_side[1])))
     scale = float(np.clip(want / photo.module_px, 0.16, 1.5))
-    if rng.random() < 0.85 and len(photo.quads):
+    if rng.random() < 0.65 and len(photo.quads):
         center = photo.quads[rng.integers(len(photo.quads))].mean(axis=0) + rng.normal(0, 0.2 * size / scale, 2)
     else:
         center = rng.uniform((0, 0), (w, h))

@@ -85,8 +85,8 @@ def label_frame(photo: Photo, found: list[Box], prob: np.ndarray, rows: int) -> 
         grid = np.array([group[i] for i in ids], dtype=np.float64)
         px = np.array([whole[i].center for i in ids])
         short = np.median([np.hypot(*whole[i].v) for i in ids])
-        hom, ok = cv2.findHomography(grid, px, cv2.RANSAC, 0.1 * short, maxIters=2000, confidence=0.999)
-        if hom is None or ok.mean() < 0.8:
+        hom, ok = cv2.findHomography(grid, px, cv2.RANSAC, 0.12 * short, maxIters=2000, confidence=0.999)
+        if hom is None or ok.mean() < 0.75:
             refused += 1
             continue
         ok = ok.ravel().astype(bool)

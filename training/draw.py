@@ -559,6 +559,29 @@ def draw(rng: Rng, size: int, short_side: tuple[float, float], empty: float = 0.
             view += w[..., :3]
             if len(quads):
                 quads_out.append(cam(world(quads)))
+    # Trees and boulders: facets about a centre, with a shadow.
+    if rng.random() < 0.3:
+        for _ in range(int(rng.integers(1, 5))):
+            c, r = rng.uniform(0, n, 2), np.exp(rng.uniform(np.log(0.15), np.log(4.0))) / texel
+            k = int(rng.integers(5, 12))
+            a = np.linspace(0, 2 * np.pi, k, endpoint=False) + rng.uniform(0, 1, k) * 3 / k
+            ring = np.stack([np.cos(a), np.sin(a)], axis=1) * r * rng.uniform(0.75, 1.1, (k, 1))
+            push = rng.normal(0, 0.6, 2) * r
+            if any(cv2.pointPolygonTest(q.astype(np.float32).reshape(-1, 1, 2), c, False) >= 0 for qs in quads_out for q in qs):
+                continue
+            shadow([c + push + ring])
+            base = (rgb(0.2, 0.28, 0.12) if rng.random() < 0.6 else rgb(0.4, 0.37, 0.33)) * rng.uniform(0.4, 1.6)
+            inner = ring * rng.uniform(0.3, 0.7)
+            for i in range(k):
+                j = (i + 1) % k
+                for t in (c + np.array([ring[i], ring[j], inner[j], inner[i]]), c + np.array([inner[i], inner[j], [0, 0]])):
+                    lo = np.clip(np.floor(t.min(axis=0)).astype(int) - 2, 0, n)
+                    hi = np.clip(np.ceil(t.max(axis=0)).astype(int) + 3, 0, n)
+                    if (hi <= lo).any():
+                        continue
+                    view = x[lo[1] : hi[1], lo[0] : hi[0]]
+                    m = poly_mask(int((hi - lo).max()), [t - lo])[: view.shape[0], : view.shape[1], None]
+                    view += (base * rng.uniform(0.6, 1.4) - view) * m
     # Bushes, some over the edge of a bench.
     if rng.random() < 0.3:
         for _ in range(int(rng.integers(1, 6))):

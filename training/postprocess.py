@@ -1,7 +1,7 @@
 """Probabilities to boxes: the reference of what the service does with the network's output.
 
 1. Components (4-connected) of `core` > CORE_T. One that is far too large is cut at rising thresholds; one that rises
-   only above CORE_LOW is taken in if it has the size of the others.
+   only above CORE_LOW is taken in if it has the size of the others and stands near one.
 2. Each component takes in its rim (one pixel, `core` > RIM_T). Moments are weighted by `core`.
 3. A module is a parallelogram (a table seen at an angle is no rectangle). The second moments C of a parallelogram
    with edges u, v are (u u' + v v') / 12; C^(-1/2) turns it into a square, whose rotation phi follows from the
@@ -134,9 +134,11 @@ def boxes(prob: np.ndarray, shrink: float, refine: bool = True) -> list[Box]:
                         s.center = s.center + (x0, y0)
             kept += parts
         # Faint ones of the right size that no strong component touches.
+        strong = np.array([b.center for b in kept])
         faint, windows = blobs_of(core, CORE_LOW)
         for b, (x0, y0, x1, y1, own) in zip(faint, windows):
-            if core[y0:y1, x0:x1][own].max() <= CORE_T and 0.4 * median < b.mass < 1.6 * median:
+            near = ((strong - b.center) ** 2).sum(axis=1).min() < (3.0 * np.sqrt(median) / shrink) ** 2
+            if near and core[y0:y1, x0:x1][own].max() <= CORE_T and 0.4 * median < b.mass < 1.6 * median:
                 kept.append(b)
         found = kept
     centers = np.array([b.center for b in found])
