@@ -7,8 +7,9 @@
    with edges u, v are (u u' + v v') / 12; C^(-1/2) turns it into a square, whose rotation phi follows from the
    fourth moment: arg E[(x + iy)^4] = pi + 4 phi. These complex moments are averaged over neighbours, for a blurred
    square of few pixels tells its rotation only faintly. Then u = sqrt(12) C^(1/2) (cos phi, sin phi), v likewise,
-   both divided by the shrink factor. VAR_PIXEL, the variance of a pixel's own area, is taken off C first.
-4. Boxes with little `module` inside, of a size far from the median (weighted by area), or overlapping a better one are dropped.
+   both divided by the shrink factor. C^(1/2) is averaged likewise, over neighbours of about the same size. VAR_PIXEL, the variance of a pixel's own area, is taken off C first.
+4. Boxes with little `module` inside, of a size far from the median (weighted by area), or overlapping a better one are
+   dropped, and weak ones without a single neighbour where the lattice would have it.
 """
 
 from __future__ import annotations
@@ -27,6 +28,9 @@ MODULE_MIN = 0.5
 SIZE_RANGE = (0.45, 2.0)  # area against the median
 OVERLAP = 0.2
 MIN_AREA = 6
+ALONE = 0.9  # score from which a box needs no neighbour
+LATTICE = 0.2  # tolerance of a neighbour's place, in modules
+SIZE_SIGMA = 0.25  # of the logarithm of sizes, likewise
 REACH = 2.0  # of the averaging over neighbours, in module sizes
 
 
@@ -143,20 +147,38 @@ def boxes(prob: np.ndarray, shrink: float, refine: bool = True) -> list[Box]:
         found = kept
     centers = np.array([b.center for b in found])
     fourth = np.array([b.fourth for b in found])
+    mass = np.array([b.mass for b in found])
+    roots = np.array([b.root for b in found])
     reach = REACH * np.sqrt(median) / shrink
     out = []
     for i, b in enumerate(found):
         d2 = ((centers - b.center) ** 2).sum(axis=1)
-        mean = (np.exp(-0.5 * d2 / reach**2) * fourth).sum()
-        phi = (np.angle(mean) - np.pi) / 4
+        k = np.exp(-0.5 * d2 / reach**2)
+        phi = (np.angle((k * fourth).sum()) - np.pi) / 4
+        # Neighbours have the same shape: those of about the same size share theirs.
+        k = k * np.exp(-0.5 * (np.log(mass / b.mass) / SIZE_SIGMA) ** 2)
+        root = (k[:, None, None] * roots).sum(axis=0) / k.sum()
         axes = np.array([[np.cos(phi), -np.sin(phi)], [np.sin(phi), np.cos(phi)]])
-        u, v = (np.sqrt(12) / shrink * b.root @ axes).T
+        u, v = (np.sqrt(12) / shrink * root @ axes).T
         if np.hypot(*v) > np.hypot(*u):
             u, v = v, -u
         out.append(Box(b.center, u, v, b.score))
     med = middle(np.array([b.area for b in out]))
     lo, hi = SIZE_RANGE
-    return suppress([b for b in out if lo * med < b.area < hi * med and inside_mean(module, b) > MODULE_MIN])
+    out = [b for b in out if lo * med < b.area < hi * med and inside_mean(module, b) > MODULE_MIN]
+    out = suppress(out)
+    return [b for b, n in zip(out, support(out)) if n >= 1 or b.score > ALONE]
+
+
+def support(found: list[Box]) -> list[int]:
+    """How many of its four lattice neighbours each box has."""
+    counts = []
+    centers = np.array([b.center for b in found]).reshape(-1, 2)
+    for b in found:
+        rel = (centers - b.center) @ np.linalg.inv(np.stack([b.u, b.v], axis=1)).T
+        steps = [(1, 0), (-1, 0), (0, 1), (0, -1)]
+        counts.append(sum(bool((np.abs(rel - np.array(s) * 1.02).max(axis=1) < LATTICE).any()) for s in steps))
+    return counts
 
 
 def inside_mean(module: np.ndarray, b: Box) -> float:
