@@ -1,16 +1,32 @@
 //! The whole story on one page: what structure from motion left in a folder becomes a model of every module.
 
+use crate::detection::external::{self, BoxError};
+use crate::detection::{DetectionError, Detector, ImageDetections};
+use crate::fusion::{self, Fused, FusionOptions, View};
+use crate::geometry::PointCloud;
+use crate::layout::{self, Layout, LayoutOptions};
+use crate::plant::assemble::{Identity, assemble};
 use crate::plant::{PlantId, PlantModel, Warning};
-use std::path::{Path, PathBuf};
+use crate::reconstruction::{self, Photo, Project, ReadError, Shot};
+use crate::refinement::{self, RefinedBench, RefinementOptions};
+use nalgebra::Vector3;
+use serde::{Deserialize, Serialize};
+use std::collections::HashMap;
+use std::path::Path;
 use std::sync::Arc;
-use std::time::Duration;
+use std::sync::mpsc::sync_channel;
+use std::time::{Duration, Instant};
+
+/// Images coarser than this do not resolve modules well enough to be searched, metres per pixel: a module of 1 m is then
+/// 16 pixels wide.
+const DEFAULT_MAX_GSD_M: f64 = 0.06;
 
 /// The stages in the order in which they run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Stage {
     /// Reconstruction, point cloud and image headers read and checked.
     Read,
-    /// Modules detected, image by image (paper, 3.2).
+    /// Images decoded and modules detected, image by image (paper, 3.2).
     Detect,
     /// Rows, benches, gaps and hypotheses of each image (3.3).
     Layout,
@@ -44,23 +60,53 @@ impl Stage {
 }
 
 /// What a mapping may be told.
-#[derive(Debug, Clone, serde::Serialize, serde::Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct MapOptions {
-    /// Rows of modules per bench; inferred where it is not given.
+    /// Rows of modules per bench, if all benches have the same known number; inferred where it is not given.
     pub rows_per_bench: Option<u32>,
     /// Ground sampling distance in metres per pixel above which an image does not resolve modules and is left out of
-    /// detection; chosen from the images where it is not given.
+    /// detection.
     pub max_gsd_m_per_px: Option<f64>,
-    /// Known spacing of module centres along and across the row, metres (3.6, last paragraph of 4.3.1).
+    /// Known spacing of module centres along and across the row, metres (last paragraph of 4.3.1): fixes the scale.
     pub spacing_m: Option<[f64; 2]>,
+    /// How positions are refined.
+    pub refinement: refinement::Method,
+    /// Most pixels that an image may have.
+    pub max_image_pixels: u64,
     /// Seed of every random choice.
     pub seed: u64,
 }
 
 impl Default for MapOptions {
     fn default() -> Self {
-        Self { rows_per_bench: None, max_gsd_m_per_px: None, spacing_m: None, seed: 1 }
+        Self {
+            rows_per_bench: None,
+            max_gsd_m_per_px: None,
+            spacing_m: None,
+            refinement: refinement::Method::default(),
+            max_image_pixels: reconstruction::photo::DEFAULT_MAX_PIXELS,
+            seed: 1,
+        }
+    }
+}
+
+impl MapOptions {
+    /// Refuses values that make no sense.
+    fn check(&self) -> Result<(), MapError> {
+        let refuse = |message: &str| {
+            Err(MapError::Input { code: "option_invalid", message: format!("{message}; leave it out or correct it") })
+        };
+        if self.rows_per_bench.is_some_and(|rows| !(1..=64).contains(&rows)) {
+            return refuse("rows_per_bench must be 1 to 64");
+        }
+        if self.max_gsd_m_per_px.is_some_and(|gsd| !(0.001..=1.0).contains(&gsd)) {
+            return refuse("max_gsd_m_per_px must be 0.001 to 1 metre per pixel");
+        }
+        if self.spacing_m.is_some_and(|spacing| spacing.iter().any(|s| !(0.1..=10.0).contains(s))) {
+            return refuse("spacing_m must be two lengths of 0.1 to 10 metres, along and across the row");
+        }
+        Ok(())
     }
 }
 
@@ -74,9 +120,18 @@ pub struct Subject {
     pub previous: Option<Arc<PlantModel>>,
 }
 
+/// Where the boxes of modules come from.
+#[derive(Clone, Copy)]
+pub enum Boxes<'a> {
+    /// A detector searches the images.
+    Detector(&'a dyn Detector),
+    /// A file made by another program, or corrected by a person.
+    File(&'a Path),
+}
+
 /// Told of progress, asked whether to stop. Called from several threads.
 pub trait Observer: Sync {
-    /// `done` of `total` units of a stage are finished (images, benches, or one unit where a stage has no parts).
+    /// `done` of `total` units of a stage are finished (images, or one unit where a stage has no parts).
     fn progress(&self, stage: Stage, done: usize, total: usize);
     /// Whether the mapping should end early with [`MapError::Cancelled`].
     fn cancelled(&self) -> bool {
@@ -93,11 +148,18 @@ pub struct StageTiming {
     pub peak_memory_bytes: Option<u64>,
 }
 
-/// A finished mapping.
+/// A finished mapping, with what a person may want to see of its making.
 #[derive(Debug)]
 pub struct Mapping {
     pub model: PlantModel,
     pub timings: Vec<StageTiming>,
+    /// The images that were searched: shots with their detections and layouts, in the same order.
+    pub photos: Vec<Photo>,
+    pub shots: Vec<Shot>,
+    pub detections: Vec<ImageDetections>,
+    pub layouts: Vec<Layout>,
+    pub fused: Fused,
+    pub refined: Vec<RefinedBench>,
 }
 
 /// Why a mapping could not be made.
@@ -113,15 +175,355 @@ pub enum MapError {
     Environment { message: String },
 }
 
-/// Maps the plant in a folder as OpenSfM leaves it: `reconstruction.json`, `reference_lla.json`, `images/`,
-/// `undistorted/` with `depthmaps/merged.ply`. `model_path` is the detector's ONNX file.
+impl From<ReadError> for MapError {
+    fn from(error: ReadError) -> Self {
+        Self::Input { code: error.code(), message: error.to_string() }
+    }
+}
+
+impl From<BoxError> for MapError {
+    fn from(error: BoxError) -> Self {
+        Self::Input { code: "boxes_invalid", message: error.to_string() }
+    }
+}
+
+impl From<DetectionError> for MapError {
+    fn from(error: DetectionError) -> Self {
+        Self::Environment { message: error.to_string() }
+    }
+}
+
+/// Measures stages and reports them.
+struct Clock<'a> {
+    observer: &'a dyn Observer,
+    timings: Vec<StageTiming>,
+}
+
+impl Clock<'_> {
+    /// Runs a stage that has no parts.
+    fn stage<T>(&mut self, stage: Stage, work: impl FnOnce() -> T) -> Result<T, MapError> {
+        if self.observer.cancelled() {
+            return Err(MapError::Cancelled);
+        }
+        self.observer.progress(stage, 0, 1);
+        let start = Instant::now();
+        let value = work();
+        self.add(stage, start.elapsed());
+        self.observer.progress(stage, 1, 1);
+        Ok(value)
+    }
+
+    fn add(&mut self, stage: Stage, wall: Duration) {
+        self.timings.push(StageTiming { stage, wall, peak_memory_bytes: peak_memory_bytes() });
+    }
+}
+
+/// Maps the plant in a folder as OpenSfM leaves it: `reconstruction.json`, `reference_lla.json`, `images/`, and
+/// `undistorted/` with `images/` and `depthmaps/merged.ply`. Equal input gives an equal model, whatever the number of
+/// threads.
+///
+/// # Errors
+/// Broken input (by file, and with what to do), a failing environment, or cancellation.
 pub fn map_folder(
     folder: &Path,
-    detector: &PathBuf,
+    boxes: Boxes<'_>,
     options: &MapOptions,
     subject: &Subject,
     observer: &dyn Observer,
 ) -> Result<Mapping, MapError> {
-    let _ = (folder, detector, options, subject, observer, Warning::new("", "", []));
-    todo!()
+    options.check()?;
+    let mut clock = Clock { observer, timings: Vec::new() };
+    let project = clock.stage(Stage::Read, || reconstruction::opensfm::read(folder, options.max_image_pixels))??;
+    let mut warnings: Vec<Warning> =
+        project.notes.iter().map(|note| Warning::new(note.code, note.message.clone(), [])).collect();
+    let cloud = cloud_of(&project);
+    let gsd_m = ground_sampling_distances(&project.reconstruction.shots, &cloud);
+
+    let seen = match boxes {
+        Boxes::Detector(detector) => {
+            let chosen = resolving_images(&project, &gsd_m, options, &mut warnings);
+            search_images(&project, &chosen, &gsd_m, detector, &mut clock)?
+        }
+        Boxes::File(path) => read_boxes(&project, path, &mut clock, &mut warnings)?,
+    };
+    let found: usize = seen.iter().map(|image| image.detections.detections.len()).sum();
+    if found == 0 {
+        return Err(MapError::Input {
+            code: "no_modules",
+            message: format!(
+                "no module was found in any of {} images: are these photos of a photovoltaic plant, taken at 20 to 100 m \
+                 above it?",
+                seen.len()
+            ),
+        });
+    }
+    let empty: Vec<String> =
+        seen.iter().filter(|s| s.layout.pieces.is_empty()).map(|s| s.detections.image.clone()).collect();
+    if !empty.is_empty() {
+        warnings.push(Warning::new(
+            "image_without_modules",
+            format!("no benches were found in {} of {} images", empty.len(), seen.len()),
+            empty,
+        ));
+    }
+
+    let shots: Vec<Shot> = seen.iter().map(|s| project.reconstruction.shots[s.shot].clone()).collect();
+    let photos: Vec<Photo> = seen.iter().map(|s| project.photos[s.shot].clone()).collect();
+    let (detections, layouts): (Vec<_>, Vec<_>) = seen.into_iter().map(|s| (s.detections, s.layout)).unzip();
+    let views: Vec<View<'_>> = shots
+        .iter()
+        .zip(&detections)
+        .zip(&layouts)
+        .map(|((shot, detections), layout)| View { shot, detections, layout })
+        .collect();
+    let located = clock.stage(Stage::Locate, || fusion::locate::locate(&views, &cloud))?;
+    let fusion_options = FusionOptions { rows_per_bench: options.rows_per_bench, ..FusionOptions::default() };
+    let fused = clock.stage(Stage::Fuse, || fusion::fuse(&views, &located, &fusion_options))?;
+    if fused.benches.is_empty() {
+        return Err(MapError::Input {
+            code: "no_benches",
+            message: format!(
+                "{found} modules were found, but no two of them form a bench that the reconstruction can place: is \
+                 reconstruction.json of these images?"
+            ),
+        });
+    }
+    let refinement_options =
+        RefinementOptions { method: options.refinement, spacing_m: options.spacing_m, seed: options.seed };
+    let refined = clock.stage(Stage::Refine, || refinement::refine(&views, &fused, &refinement_options))?;
+    let identity = Identity {
+        plant: subject.plant,
+        plant_name: &subject.plant_name,
+        survey: &subject.survey,
+        previous: subject.previous.as_deref(),
+    };
+    let model = clock.stage(Stage::Assemble, || {
+        assemble(&views, &fused, &refined, project.reconstruction.reference, vertical_datum(), &identity, warnings)
+    })?;
+    let timings = clock.timings;
+    Ok(Mapping { model, timings, photos, shots, detections, layouts, fused, refined })
+}
+
+/// The points that modules are located by: the dense cloud, or the sparse points where there is none.
+fn cloud_of(project: &Project) -> PointCloud {
+    match &project.reconstruction.dense {
+        Some(dense) => dense.clone(),
+        None => PointCloud {
+            positions_m: project
+                .reconstruction
+                .sparse_points_m
+                .iter()
+                .map(|p| [p.x as f32, p.y as f32, p.z as f32])
+                .collect(),
+            normals: Vec::new(),
+        },
+    }
+}
+
+/// Metres on the ground per pixel of each shot, by the depth of the points that it shows; `None` where it shows none.
+fn ground_sampling_distances(shots: &[Shot], cloud: &PointCloud) -> Vec<Option<f64>> {
+    let stride = (cloud.positions_m.len() / 4000).max(1);
+    let samples: Vec<Vector3<f64>> = cloud
+        .positions_m
+        .iter()
+        .step_by(stride)
+        .map(|p| Vector3::new(f64::from(p[0]), f64::from(p[1]), f64::from(p[2])))
+        .collect();
+    shots
+        .iter()
+        .map(|shot| {
+            let mut depths: Vec<f64> = samples
+                .iter()
+                .filter_map(|point| {
+                    let camera_m = shot.pose.to_camera(point);
+                    let pixel = shot.camera.project(&camera_m)?;
+                    let inside = (0.0..f64::from(shot.camera.width_px)).contains(&pixel.x)
+                        && (0.0..f64::from(shot.camera.height_px)).contains(&pixel.y);
+                    inside.then_some(camera_m.z)
+                })
+                .collect();
+            depths.sort_by(f64::total_cmp);
+            Some(depths.get(depths.len() / 2)? / shot.camera.focal_px())
+        })
+        .collect()
+}
+
+/// Indices of the shots whose images resolve modules. The others helped the reconstruction (the paper's supplementary
+/// images) and are left out, with a note.
+fn resolving_images(
+    project: &Project,
+    gsd_m: &[Option<f64>],
+    options: &MapOptions,
+    warnings: &mut Vec<Warning>,
+) -> Vec<usize> {
+    let mut limit = options.max_gsd_m_per_px.unwrap_or(DEFAULT_MAX_GSD_M);
+    let resolves =
+        |limit: f64| -> Vec<usize> { (0..gsd_m.len()).filter(|k| gsd_m[*k].is_none_or(|gsd| gsd <= limit)).collect() };
+    let mut chosen = resolves(limit);
+    if chosen.len() < 2 && options.max_gsd_m_per_px.is_none() {
+        // All were taken from high up: search the finest there are, and say so.
+        let finest = gsd_m.iter().flatten().copied().fold(f64::INFINITY, f64::min);
+        limit = finest * 1.3;
+        chosen = resolves(limit);
+        warnings.push(Warning::new(
+            "images_coarse",
+            format!(
+                "all images are coarser than {DEFAULT_MAX_GSD_M} m per pixel; those up to {limit:.3} are searched all the \
+                 same: expect missed modules, or fly lower"
+            ),
+            [],
+        ));
+    }
+    let shots = &project.reconstruction.shots;
+    let left_out: Vec<usize> = (0..shots.len()).filter(|k| !chosen.contains(k)).collect();
+    if !left_out.is_empty() {
+        let coarsest = left_out.iter().filter_map(|k| gsd_m[*k]).fold(0.0, f64::max);
+        warnings.push(Warning::new(
+            "images_supplementary",
+            format!(
+                "{} of {} images are too coarse to resolve modules (up to {coarsest:.3} m per pixel, limit {limit:.3}): \
+                 they served the reconstruction and are not searched",
+                left_out.len(),
+                shots.len()
+            ),
+            left_out.iter().map(|k| shots[*k].name.clone()),
+        ));
+    }
+    chosen
+}
+
+/// An image that was searched.
+struct Seen {
+    shot: usize,
+    detections: ImageDetections,
+    layout: Layout,
+}
+
+/// Detects and lays out image by image: while one image is searched, the next is decoded and the last is laid out, so
+/// that no more than a few images are in memory at once.
+fn search_images(
+    project: &Project,
+    chosen: &[usize],
+    gsd_m: &[Option<f64>],
+    detector: &dyn Detector,
+    clock: &mut Clock<'_>,
+) -> Result<Vec<Seen>, MapError> {
+    let observer = clock.observer;
+    let start = Instant::now();
+    let total = chosen.len();
+    observer.progress(Stage::Detect, 0, total);
+    let (seen, layout_time) = std::thread::scope(|scope| -> Result<(Vec<Seen>, Duration), MapError> {
+        let (decoded_sender, decoded) = sync_channel(1);
+        scope.spawn(move || {
+            for &shot in chosen {
+                let image = project.photos[shot].load();
+                if decoded_sender.send((shot, image)).is_err() {
+                    break;
+                }
+            }
+        });
+        let (found_sender, found) = sync_channel::<(usize, image::RgbImage, ImageDetections)>(1);
+        let laying_out = scope.spawn(move || {
+            let mut seen = Vec::with_capacity(total);
+            let mut spent = Duration::ZERO;
+            for (shot, image, detections) in found {
+                let start = Instant::now();
+                let grey = image::imageops::grayscale(&image);
+                let layout = layout::infer(&detections, Some(&grey), &LayoutOptions::default());
+                seen.push(Seen { shot, detections, layout });
+                spent += start.elapsed();
+            }
+            (seen, spent)
+        });
+        for (done, (shot, image)) in decoded.iter().enumerate() {
+            if observer.cancelled() {
+                return Err(MapError::Cancelled);
+            }
+            let image = image.map_err(ReadError::Photo)?;
+            let detections = ImageDetections {
+                image: project.reconstruction.shots[shot].name.clone(),
+                width_px: image.width(),
+                height_px: image.height(),
+                detections: detector.detect(&image, gsd_m[shot])?,
+            };
+            if found_sender.send((shot, image, detections)).is_err() {
+                break;
+            }
+            observer.progress(Stage::Detect, done + 1, total);
+        }
+        drop(found_sender);
+        laying_out
+            .join()
+            .map_err(|_| MapError::Environment { message: "laying out an image failed unexpectedly".to_owned() })
+    })?;
+    let wall = start.elapsed();
+    clock.add(Stage::Detect, wall.saturating_sub(layout_time));
+    clock.add(Stage::Layout, layout_time);
+    observer.progress(Stage::Layout, total, total);
+    Ok(seen)
+}
+
+/// Takes the boxes of a file instead of searching; images are decoded only to look at the ground between modules.
+fn read_boxes(
+    project: &Project,
+    path: &Path,
+    clock: &mut Clock<'_>,
+    warnings: &mut Vec<Warning>,
+) -> Result<Vec<Seen>, MapError> {
+    let given = clock.stage(Stage::Detect, || external::read(path))??;
+    let by_name: HashMap<&str, usize> =
+        project.reconstruction.shots.iter().enumerate().map(|(index, shot)| (shot.name.as_str(), index)).collect();
+    let mut seen: Vec<(usize, ImageDetections)> = Vec::new();
+    let mut unknown = Vec::new();
+    for detections in given {
+        let Some(&shot) = by_name.get(detections.image.as_str()) else {
+            unknown.push(detections.image);
+            continue;
+        };
+        let camera = &project.reconstruction.shots[shot].camera;
+        if (detections.width_px, detections.height_px) != (camera.width_px, camera.height_px) {
+            return Err(MapError::Input {
+                code: "boxes_invalid",
+                message: format!(
+                    "the boxes of {} are for {} x {} pixels, but its undistorted image has {} x {}: give boxes in pixels of \
+                     that image",
+                    detections.image, detections.width_px, detections.height_px, camera.width_px, camera.height_px
+                ),
+            });
+        }
+        seen.push((shot, detections));
+    }
+    if !unknown.is_empty() {
+        warnings.push(Warning::new(
+            "boxes_without_shot",
+            format!("{} images with boxes are not in the reconstruction and are left out", unknown.len()),
+            unknown,
+        ));
+    }
+    seen.sort_by_key(|(shot, _)| *shot);
+    seen.dedup_by_key(|(shot, _)| *shot);
+    clock.stage(Stage::Layout, || {
+        use rayon::prelude::*;
+        seen.into_par_iter()
+            .map(|(shot, detections)| {
+                let grey = project.photos[shot].load().map(|image| image::imageops::grayscale(&image));
+                let grey = grey.map_err(ReadError::Photo)?;
+                let layout = layout::infer(&detections, Some(&grey), &LayoutOptions::default());
+                Ok(Seen { shot, detections, layout })
+            })
+            .collect()
+    })?
+}
+
+fn vertical_datum() -> String {
+    "as the image positions that the reconstruction was aligned to (for drones usually height above the WGS84 ellipsoid or \
+     a barometric height; not checked)"
+        .to_owned()
+}
+
+/// Highest resident memory of this process so far, bytes, where `/proc` tells it.
+fn peak_memory_bytes() -> Option<u64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find(|line| line.starts_with("VmHWM:"))?;
+    Some(line.split_ascii_whitespace().nth(1)?.parse::<u64>().ok()? * 1024)
 }

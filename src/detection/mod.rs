@@ -3,6 +3,7 @@
 pub mod external;
 
 use crate::geometry::Quad;
+use image::RgbImage;
 use serde::{Deserialize, Serialize};
 
 /// Which detector found a module.
@@ -35,4 +36,18 @@ pub struct ImageDetections {
     pub width_px: u32,
     pub height_px: u32,
     pub detections: Vec<Detection>,
+}
+
+/// Finds modules in images.
+pub trait Detector: Send + Sync {
+    /// The modules in an image whose ground sampling distance (metres per pixel) may be known.
+    fn detect(&self, image: &RgbImage, gsd_m: Option<f64>) -> Result<Vec<Detection>, DetectionError>;
+    /// One line for logs: the model, and what runs it.
+    fn describe(&self) -> String;
+}
+
+#[derive(Debug, thiserror::Error)]
+pub enum DetectionError {
+    #[error("{0}")]
+    Runtime(String),
 }

@@ -26,6 +26,9 @@ const LIKELY: f64 = 2.5;
 /// Standard deviation of the disagreement of two views before anything is known of them, metres.
 const PRIOR_SIGMA_M: f64 = 0.35;
 
+/// Degrees of freedom of the positions' errors: few, for local errors of structure from motion have long tails.
+const TAIL: f64 = 4.0;
+
 /// A shift under which two pieces may be the same: column and row of `b` are those of `a` plus this.
 #[derive(Debug, Clone, Copy)]
 struct Hypothesis {
@@ -235,7 +238,7 @@ fn pair(a: usize, b: usize, pieces: &[LocatedPiece], options: &FusionOptions) ->
     let mut shifts: Vec<(f64, f64, f64, Vector2<f64>)> = Vec::new();
     let stride = (first.cells.len() / 24).max(1);
     for cell in first.cells.iter().step_by(stride) {
-        let at = second.ground.coordinate(cell.position_m.xy())?;
+        let Some(at) = second.ground.coordinate(cell.position_m.xy()) else { continue };
         let outside_col = (-at.x).max(at.x - f64::from(second.cols - 1)).max(0.0);
         let outside_row = (-at.y).max(at.y - f64::from(second.rows - 1)).max(0.0);
         shifts.push((
@@ -246,7 +249,7 @@ fn pair(a: usize, b: usize, pieces: &[LocatedPiece], options: &FusionOptions) ->
         ));
     }
     shifts.sort_by(|p, q| p.0.total_cmp(&q.0));
-    let nearest = shifts[0].0;
+    let nearest = shifts.first()?.0;
     let reach = options.max_disparity_m / other_u.norm().min(other_v.norm()) + 0.5;
     if nearest > reach {
         return None;
@@ -400,13 +403,15 @@ impl DisparityField {
 
 /// Total cost of each hypothesis of a pair.
 fn costs(pair: &Pair, pieces: &[LocatedPiece], field: &DisparityField) -> Vec<f64> {
-    let (expected, sigma) = field.expected(pieces[pair.a].view, pieces[pair.b].view, pair.at_m);
+    let (a, b) = (&pieces[pair.a], &pieces[pair.b]);
+    let (expected, field_sigma) = field.expected(a.view, b.view, pair.at_m);
+    let sigma = (field_sigma.powi(2) + a.sigma_m.powi(2) + b.sigma_m.powi(2)).sqrt();
     pair.hypotheses
         .iter()
         .map(|hypothesis| {
             let off = (hypothesis.disparity_m - expected).norm() / sigma;
-            // Quadratic near, linear far: positions may be wrong by more than they admit.
-            let position = if off < 3.0 { 0.5 * off * off } else { 3.0 * off - 4.5 };
+            // Student's t in the plane: positions may be wrong by far more than they admit.
+            let position = (TAIL + 2.0) / 2.0 * (1.0 + off * off / TAIL).ln();
             hypothesis.structure_cost + position
         })
         .collect()

@@ -5,6 +5,8 @@ use super::associate::Clusters;
 use super::{Doubt, LocatedPiece, View};
 use crate::layout::End;
 use nalgebra::{Vector2, Vector3};
+use rstar::RTree;
+use rstar::primitives::GeomWithData;
 use std::collections::{BTreeMap, BTreeSet};
 
 /// A module seen in one view.
@@ -179,6 +181,69 @@ fn assemble_bench(
     };
     doubts.extend(holes_to_check(views, &bench));
     Some(bench)
+}
+
+/// Takes out benches that stand on top of another one: the same bench once more, which the evidence could not join. The
+/// one with fewer observations goes, and it is told.
+pub fn without_ghosts(views: &[View<'_>], benches: Vec<FusedBench>, doubts: &mut Vec<Doubt>) -> Vec<FusedBench> {
+    let position = |module: &FusedModule| {
+        let count = module.observations.len() as f64;
+        module.observations.iter().map(|o| o.position_m.xy()).sum::<Vector2<f64>>() / count
+    };
+    let weight = |bench: &FusedBench| bench.modules.iter().map(|m| m.observations.len()).sum::<usize>();
+    let mut order: Vec<usize> = (0..benches.len()).collect();
+    order.sort_by_key(|k| (std::cmp::Reverse(weight(&benches[*k])), *k));
+    let tree = RTree::bulk_load(
+        benches
+            .iter()
+            .enumerate()
+            .flat_map(|(index, bench)| {
+                bench.modules.iter().map(move |m| {
+                    let at = position(m);
+                    GeomWithData::new([at.x, at.y], index)
+                })
+            })
+            .collect(),
+    );
+    let mut kept = vec![false; benches.len()];
+    for &index in &order {
+        let bench = &benches[index];
+        let [u, v] = bench.pitch_m;
+        let reach = 0.6 * u.norm().min(if bench.rows > 1 { v.norm() } else { u.norm() });
+        let mut covered = 0;
+        let mut over = None;
+        for module in &bench.modules {
+            let at = position(module);
+            let other = tree
+                .locate_within_distance([at.x, at.y], reach * reach)
+                .filter(|near| near.data != index && kept[near.data])
+                .map(|near| near.data)
+                .min();
+            if other.is_some() {
+                covered += 1;
+                over = other;
+            }
+        }
+        kept[index] = 3 * covered <= bench.modules.len();
+        if !kept[index] {
+            let names: BTreeSet<String> = bench
+                .modules
+                .iter()
+                .flat_map(|m| m.observations.iter().map(|o| views[o.view].shot.name.clone()))
+                .collect();
+            let at = over.map_or(bench.middle_m, |k| benches[k].middle_m);
+            doubts.push(Doubt {
+                code: "bench_seen_apart",
+                message: format!(
+                    "{} modules seen at {:.1} m east, {:.1} m north lie over the bench at {:.1} m east, {:.1} m north, but \
+                     do not fit its lattice; they are left out: check these images",
+                    bench.modules.len(), bench.middle_m.x, bench.middle_m.y, at.x, at.y
+                ),
+                images: names.into_iter().collect(),
+            });
+        }
+    }
+    benches.into_iter().zip(kept).filter_map(|(bench, keep)| keep.then_some(bench)).collect()
 }
 
 /// Places inside the bench where no view detected a module: said, not filled.

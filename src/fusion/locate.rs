@@ -47,6 +47,8 @@ pub struct LocatedPiece {
     pub bridges: Vec<i32>,
     /// Lattice coordinates (column, row) to east and north, metres.
     pub ground: LatticeMap,
+    /// How well the cloud tells where the piece stands, one standard deviation, metres.
+    pub sigma_m: f64,
 }
 
 impl LocatedPiece {
@@ -378,7 +380,6 @@ fn located_piece(
         [ground_at(col + 0.5, row) - ground_at(col - 0.5, row), ground_at(col, row + 0.5) - ground_at(col, row - 0.5)];
     let mut located = LocatedPiece {
         view,
-        cells,
         rows: piece.rows,
         cols: piece.cols,
         west: piece.west,
@@ -387,7 +388,22 @@ fn located_piece(
         south: piece.south,
         bridges: piece.bridges.clone(),
         ground: piece.map.clone(),
+        sigma_m: cloud_sigma_m(&cells),
+        cells,
     };
     located.refit(fallback);
     located
+}
+
+/// Standard deviation of a piece's place by the scatter of the cloud about its surface, and by how much of it has points
+/// at all, metres.
+fn cloud_sigma_m(cells: &[LocatedCell]) -> f64 {
+    let mut scatter: Vec<f64> =
+        cells.iter().filter_map(|cell| Some((cell.cloud_m? - cell.position_m).norm())).collect();
+    if scatter.is_empty() {
+        return 0.5;
+    }
+    scatter.sort_by(f64::total_cmp);
+    let without = 1.0 - scatter.len() as f64 / cells.len() as f64;
+    0.03 + 0.3 * scatter[scatter.len() / 2] + 0.3 * without
 }

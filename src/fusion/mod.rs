@@ -73,6 +73,7 @@ pub fn fuse(views: &[View<'_>], located: &Located, options: &FusionOptions) -> F
     }
     doubts.extend(clusters.doubts.iter().map(|doubt| doubt.describe(views, &pieces)));
     let benches = benches::assemble(views, &pieces, &clusters, &mut doubts);
+    let benches = benches::without_ghosts(views, benches, &mut doubts);
     let (lines, benches) = lines::arrange(benches);
     Fused { lines, benches, doubts }
 }

@@ -8,6 +8,8 @@ use nalgebra::{DMatrix, DVector, Vector2};
 pub struct LatticeMap {
     center: Vector2<f64>,
     scale: f64,
+    /// Half the extent of the samples along each axis, plus one half: beyond it the map goes on straight.
+    reach: Vector2<f64>,
     /// Powers (of column, of row) and the coefficient in pixels.
     terms: Vec<(u8, u8, Vector2<f64>)>,
 }
@@ -53,7 +55,8 @@ impl LatticeMap {
             powers.push((0, 2));
         }
         let mut weights = vec![1.0; samples.len()];
-        let mut map = Self { center, scale, terms: Vec::new() };
+        let reach = Vector2::new(cols, rows) / 2.0;
+        let mut map = Self { center, scale, reach, terms: Vec::new() };
         let pitch = side_u.norm().min(side_v.norm()).max(1e-9);
         for round in 0..6 {
             map.terms = map.solve(samples, &weights, &powers);
@@ -120,8 +123,23 @@ impl LatticeMap {
         }
     }
 
-    /// The pixel of a lattice coordinate.
+    /// The pixel of a lattice coordinate. Beyond the samples the map goes on straight: a bend must not run away.
     pub fn pixel(&self, col: f64, row: f64) -> Vector2<f64> {
+        let inside = |value: f64, axis: usize| {
+            value.clamp(self.center[axis] - self.reach[axis], self.center[axis] + self.reach[axis])
+        };
+        let (c, r) = (inside(col, 0), inside(row, 1));
+        let mut pixel = self.polynomial(c, r);
+        if c != col {
+            pixel += (self.polynomial(c + 0.5, r) - self.polynomial(c - 0.5, r)) * (col - c);
+        }
+        if r != row {
+            pixel += (self.polynomial(c, r + 0.5) - self.polynomial(c, r - 0.5)) * (row - r);
+        }
+        pixel
+    }
+
+    fn polynomial(&self, col: f64, row: f64) -> Vector2<f64> {
         self.terms.iter().map(|(i, j, coefficient)| *coefficient * self.basis(col, row, (*i, *j))).sum()
     }
 
