@@ -99,20 +99,33 @@ def label_frame(photo: Photo, found: list[Box], prob: np.ndarray, rows: int) -> 
         if np.median(residual) > 0.06 * short:
             refused += 1
             continue
-        lo, hi = int(grid[ok, 0].min()) - 4, int(grid[ok, 0].max()) + 4
+        lo, hi = int(grid[ok, 0].min()), int(grid[ok, 0].max())
         half = FACE / 2
-        for j in across:
-            for i in range(lo, hi + 1):
+
+        def column(i: int) -> bool:
+            """Labels one column; whether any of its cells is a module within the frame."""
+            some = False
+            for j in across:
                 cell = np.array([[i - half, j - half], [i + half, j - half], [i + half, j + half], [i - half, j + half]])
                 q = transform(cell, hom)
                 if not np.isfinite(q).all() or (q.max(axis=0) < 0).any() or (q.min(axis=0) > (w, h)).any():
                     continue
                 mask = np.zeros((h, w), np.uint8)
                 cv2.fillConvexPoly(mask, np.round(q * 16).astype(np.int32), 1, cv2.LINE_8, 4)
-                if mask.sum() < 4 or prob[0][mask > 0].mean() < 0.6:
+                if mask.sum() < 4 or prob[0][mask > 0].mean() < 0.6 or taken[mask > 0].mean() > 0.3:
                     continue  # past the end of the bench
-                taken |= mask
+                taken[mask > 0] = 1
                 quads.append(np.round(q, 2).tolist())
+                some = True
+            return some
+
+        for i in range(lo, hi + 1):
+            column(i)
+        # On from both ends, as far as the frame goes or the bench does.
+        for start, step in ((lo - 1, -1), (hi + 1, 1)):
+            i = start
+            while abs(i - start) < 4 and column(i):
+                i += step
     # What looks like a module and is none of the lattices': not labelled, so not counted.
     rest = ((prob[0] > 0.35) & (cv2.dilate(taken, np.ones((7, 7), np.uint8)) == 0)).astype(np.uint8)
     rest = cv2.dilate(cv2.morphologyEx(rest, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8)), np.ones((9, 9), np.uint8))

@@ -164,6 +164,9 @@ def test_sets() -> dict[str, list[tuple[Photo, float]]]:
     held = sources.real_frames(test=True)
     sets["real held out, 1/2"] = [(p, 0.5) for p in held]
     sets["real held out, 1/3"] = [(p, 1 / 3) for p in held]
+    west = sources.west_test()
+    if west:
+        sets["missouri-west, north"] = [(p, 1.0) for p in west]
     return sets
 
 

@@ -26,6 +26,7 @@ def main() -> None:
     p.add_argument("--checkpoint", type=Path, default=Path("runs/unet/checkpoint.pt"))
     p.add_argument("--out", type=Path, default=Path("models/unet.onnx"))
     p.add_argument("--version", default="0.1.0")
+    p.add_argument("--self-frames", type=int, default=0, help="self-labelled frames it was trained on (for the card)")
     a = p.parse_args()
     state = torch.load(a.checkpoint, map_location="cpu", weights_only=True)
     net = UNet(tuple(state["widths"]))
@@ -56,6 +57,7 @@ def main() -> None:
             "heliomap.gsd_range_m": ",".join(str(v) for v in GSD_RANGE),
             "heliomap.version": f"{a.version}+{digest}",
             "heliomap.steps": str(state["step"]),
+            "heliomap.self_frames": str(a.self_frames),
         },
     )
     onnx.checker.check_model(onnx_model)

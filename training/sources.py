@@ -130,6 +130,15 @@ def train_renders() -> list[Photo]:
     return [photo for folder in render_folders(test=False) for photo in load_render(folder)]
 
 
+def west_test() -> list[Photo]:
+    """Test frames of missouri-west with the labels kept in this folder."""
+    path, root = Path(__file__).with_name("labels") / "missouri-west-test.json", data_root() / "missouri-west" / "images"
+    if not path.exists() or not root.exists():
+        return []
+    labels = json.loads(path.read_text())
+    return load_labelled(root, labels, sorted(labels))
+
+
 def self_labelled(path: str | None) -> list[Photo]:
     """Frames of missouri-west with labels written by `training.bootstrap` (see README)."""
     if not path or not Path(path).exists():
