@@ -7,6 +7,7 @@ pub mod detection;
 pub mod fusion;
 pub mod geometry;
 pub mod layout;
+pub mod overlay;
 pub mod pipeline;
 pub mod plant;
 pub mod reconstruction;

@@ -260,6 +260,8 @@ struct DepthModel {
     origin: Vector2<f64>,
     along: Vector2<f64>,
     scale: f64,
+    /// Median of the samples.
+    typical: f64,
     terms: [f64; 4],
 }
 
@@ -285,7 +287,7 @@ impl DepthModel {
         let origin = samples.iter().map(|s| s.normalised).sum::<Vector2<f64>>() / samples.len() as f64;
         let scale = samples.iter().map(|s| (s.normalised - origin).norm()).fold(1e-6, f64::max);
         let along = prior.map_or(Vector2::x(), |(_, along)| along);
-        let mut model = Self { origin, along, scale, terms: [median, 0.0, 0.0, 0.0] };
+        let mut model = Self { origin, along, scale, typical: median, terms: [median, 0.0, 0.0, 0.0] };
         // The prior's slopes in this model's units; a slope of one degree is its standard deviation.
         let slopes = prior.map(|(plane, _)| {
             let step = 1e-3;
@@ -345,7 +347,8 @@ impl DepthModel {
     /// The point in the world that a pixel shows.
     fn point(&self, shot: &Shot, pixel: Vector2<f64>) -> Vector3<f64> {
         let normalised = shot.camera.normalised_from_pixel(pixel);
-        let depth = 1.0 / self.inverse_depth(normalised).max(1e-6);
+        // Far from its samples a slope must not run through the horizon.
+        let depth = 1.0 / self.inverse_depth(normalised).clamp(0.5 * self.typical, 2.0 * self.typical);
         let camera = Vector3::new(normalised.x, normalised.y, 1.0) * depth;
         shot.pose.direction_to_world(&camera) + shot.pose.center()
     }

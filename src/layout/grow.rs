@@ -242,49 +242,61 @@ fn cut_gaps(
     options: &LayoutOptions,
 ) {
     let sides = component.sides(nodes);
-    for axis in 0..2 {
-        // (transition, position across it) -> the two nodes.
-        let mut crossings: BTreeMap<(i32, i32), (usize, usize)> = BTreeMap::new();
+    let scale = sides[0].norm().min(sides[1].norm());
+    // For each axis: (transition, position across it) -> the two nodes and by how much they stand too far apart.
+    let crossings = [0, 1].map(|axis| {
+        let mut found: BTreeMap<(i32, i32), (usize, usize, f64)> = BTreeMap::new();
         for (&(col, row), &i) in &component.places {
             let next = if axis == 0 { (col + 1, row) } else { (col, row + 1) };
             if let Some(&j) = component.places.get(&next) {
                 let own = (axis + component.turns[&i]) % 4;
                 if matches!(links[i][own], Some((k, _)) if k == j) {
-                    crossings.insert(if axis == 0 { (col, row) } else { (row, col) }, (i, j));
+                    found.insert(if axis == 0 { (col, row) } else { (row, col) }, (i, j, 0.0));
                 }
             }
         }
-        if crossings.is_empty() {
-            continue;
-        }
-        let lengths: Vec<(Vector2<f64>, f64)> = crossings
+        let lengths: Vec<(Vector2<f64>, f64)> = found
             .values()
-            .map(|&(i, j)| ((nodes[i].center + nodes[j].center) / 2.0, (nodes[j].center - nodes[i].center).norm()))
+            .map(|&(i, j, _)| ((nodes[i].center + nodes[j].center) / 2.0, (nodes[j].center - nodes[i].center).norm()))
             .collect();
-        let expected = pitch_model(&lengths, sides[axis].norm());
-        let scale = sides[0].norm().min(sides[1].norm());
-        let excess: Vec<f64> =
-            lengths.iter().zip(&expected).map(|((_, length), pitch)| (length - pitch) / scale).collect();
-        let keys: Vec<(i32, i32)> = crossings.keys().copied().collect();
-        let pairs: Vec<(usize, usize)> = crossings.values().copied().collect();
+        if !lengths.is_empty() {
+            let expected = pitch_model(&lengths, sides[axis].norm());
+            for ((crossing, (_, length)), pitch) in found.values_mut().zip(&lengths).zip(expected) {
+                crossing.2 = (length - pitch) / scale;
+            }
+        }
+        found
+    });
+    for axis in 0..2 {
+        let keys: Vec<(i32, i32)> = crossings[axis].keys().copied().collect();
+        let links_here: Vec<(usize, usize, f64)> = crossings[axis].values().copied().collect();
+        // Two crossings belong together if their modules are neighbours without an aisle between them.
+        let together = |first: usize, second: usize| {
+            let (from, to) = (keys[first], keys[second]);
+            let tight = |at: i32| crossings[1 - axis].get(&(from.1, at)).is_some_and(|c| c.2 <= options.gap_threshold);
+            to.0 == from.0 && to.1 == from.1 + 1 && (tight(from.0) || tight(from.0 + 1))
+        };
         let mut start = 0;
         while start < keys.len() {
             let mut end = start + 1;
-            while end < keys.len() && keys[end].0 == keys[start].0 && keys[end].1 == keys[end - 1].1 + 1 {
+            while end < keys.len() && together(end - 1, end) {
                 end += 1;
             }
-            let wide = median(&mut excess[start..end].to_vec());
+            let group = &links_here[start..end];
+            let wide = median(&mut group.iter().map(|link| link.2).collect::<Vec<_>>());
             let mut gap = wide > options.gap_threshold;
             if let Some(grey) = grey.filter(|_| !gap && wide > 0.5 * options.gap_threshold) {
                 // Between a seam and a gap by its width: the ground decides (histograms of the transitions, Fig. 8).
-                let quads = |(i, j): (usize, usize)| (detections.detections[i].quad, detections.detections[j].quad);
+                let quads = |link: &(usize, usize, f64)| {
+                    (detections.detections[link.0].quad, detections.detections[link.1].quad)
+                };
                 let usual: Vec<(Quad, Quad)> =
-                    (0..pairs.len()).filter(|k| excess[*k].abs() < 0.03).take(40).map(|k| quads(pairs[k])).collect();
-                let here: Vec<(Quad, Quad)> = (start..end).map(|k| quads(pairs[k])).collect();
+                    links_here.iter().filter(|link| link.2.abs() < 0.03).take(40).map(quads).collect();
+                let here: Vec<(Quad, Quad)> = group.iter().map(quads).collect();
                 gap = transition::is_gap(grey, &here, &usual);
             }
             if gap {
-                for &(i, j) in &pairs[start..end] {
+                for &(i, j, _) in group {
                     for (from, to) in [(i, j), (j, i)] {
                         for link in &mut links[from] {
                             if matches!(link, Some((k, _)) if *k == to) {

@@ -128,3 +128,140 @@ pub fn infer(detections: &ImageDetections, grey: Option<&GrayImage>, options: &L
         loose,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::detection::{Detection, Source};
+    use proptest::prelude::*;
+
+    /// A bench on the ground: where it begins, rows, columns, places left empty.
+    struct Table {
+        at: [f64; 2],
+        rows: i32,
+        cols: i32,
+        missing: Vec<(i32, i32)>,
+    }
+
+    fn table(x: f64, y: f64, rows: i32, cols: i32) -> Table {
+        Table { at: [x, y], rows, cols, missing: vec![] }
+    }
+
+    /// Modules of 24 x 38 px (pitch 24.5 x 38.5) seen with some perspective, turned about the middle of a 1200 x 900
+    /// frame. Modules not wholly inside are left out, as detectors do.
+    fn image(tables: &[Table], turn_deg: f64, perspective: f64) -> ImageDetections {
+        let (sin, cos) = turn_deg.to_radians().sin_cos();
+        let look = |p: Vector2<f64>| {
+            let p = p - Vector2::new(600.0, 450.0);
+            let w = 1.0 + perspective * (0.3 * p.x + p.y) / 900.0;
+            Vector2::new(cos * p.x - sin * p.y, sin * p.x + cos * p.y) / w + Vector2::new(600.0, 450.0)
+        };
+        let mut detections = Vec::new();
+        for table in tables {
+            for row in 0..table.rows {
+                for col in 0..table.cols {
+                    if table.missing.contains(&(row, col)) {
+                        continue;
+                    }
+                    let center = Vector2::new(table.at[0] + 24.5 * f64::from(col), table.at[1] + 38.5 * f64::from(row));
+                    let quad = Quad::from_center(center, Vector2::new(12.0, 0.0), Vector2::new(0.0, 19.0)).map(look);
+                    let inside = quad.corners.iter().all(|c| c.x > 2.0 && c.y > 2.0 && c.x < 1197.0 && c.y < 897.0);
+                    if inside {
+                        let quad = Quad::from_unordered(quad.corners).unwrap();
+                        detections.push(Detection { quad, score: 1.0, source: Source::External });
+                    }
+                }
+            }
+        }
+        ImageDetections { image: "a.jpg".to_owned(), width_px: 1200, height_px: 900, detections }
+    }
+
+    fn shapes(layout: &Layout) -> Vec<(i32, i32)> {
+        let mut shapes: Vec<(i32, i32)> = layout.pieces.iter().map(|p| (p.rows, p.cols)).collect();
+        shapes.sort_unstable();
+        shapes
+    }
+
+    #[test]
+    fn two_benches_with_a_narrow_gap_are_two_pieces_and_a_keypoint_per_row() {
+        // The gap is 0.15 of the pitch wider than a seam.
+        let tables = [table(300.0, 300.0, 2, 10), table(300.0 + 245.0 + 3.7, 300.0, 2, 12)];
+        let layout = infer(&image(&tables, 0.0, 0.0), None, &LayoutOptions::default());
+        assert_eq!(shapes(&layout), [(2, 10), (2, 12)]);
+        assert_eq!(layout.gaps.len(), 2);
+        assert!(layout.gaps.iter().all(|gap| (gap.pitches - 1.15).abs() < 0.02));
+        assert!(layout.pieces.iter().all(|p| [p.west, p.east, p.north, p.south] == [End::Closed; 4]));
+        assert!(layout.loose.is_empty());
+    }
+
+    #[test]
+    fn a_missed_module_becomes_a_hypothesis_where_it_should_be() {
+        let mut hole = table(300.0, 300.0, 3, 10);
+        hole.missing = vec![(1, 4), (1, 5)];
+        let layout = infer(&image(&[hole], 0.0, 0.1), None, &LayoutOptions::default());
+        assert_eq!(shapes(&layout), [(3, 10)]);
+        let guesses: Vec<(i32, i32)> =
+            layout.pieces[0].cells.iter().filter(|c| c.detection.is_none()).map(|c| (c.row, c.col)).collect();
+        assert_eq!(guesses, [(1, 4), (1, 5)]);
+        let whole = image(&[table(300.0, 300.0, 3, 10)], 0.0, 0.1);
+        let guess = layout.pieces[0].cell(1, 4).unwrap().quad;
+        let best = whole.detections.iter().map(|d| d.quad.iou(&guess)).fold(0.0, f64::max);
+        assert!(best > 0.9, "{best}");
+    }
+
+    #[test]
+    fn the_frame_cuts_and_does_not_close() {
+        let layout = infer(&image(&[table(700.0, 400.0, 2, 40)], 0.0, 0.0), None, &LayoutOptions::default());
+        let piece = &layout.pieces[0];
+        assert_eq!(
+            (piece.west, piece.east, piece.north, piece.south),
+            (End::Closed, End::Cut, End::Closed, End::Closed)
+        );
+    }
+
+    #[test]
+    fn one_row_bridges_a_missed_module_and_two_rows_do_not_bridge_an_empty_column() {
+        let mut single = table(200.0, 200.0, 1, 20);
+        single.missing = vec![(0, 7)];
+        let mut double = table(200.0, 500.0, 2, 20);
+        double.missing = vec![(0, 7), (1, 7)];
+        let layout = infer(&image(&[single, double], 0.0, 0.0), None, &LayoutOptions::default());
+        assert_eq!(shapes(&layout), [(1, 20), (2, 7), (2, 12)]);
+        let single = layout.pieces.iter().find(|p| p.rows == 1).unwrap();
+        assert_eq!(single.bridges, [6]);
+    }
+
+    #[test]
+    fn nothing_gives_nothing() {
+        let layout = infer(&image(&[], 0.0, 0.0), None, &LayoutOptions::default());
+        assert!(layout.pieces.is_empty() && layout.gaps.is_empty() && layout.loose.is_empty());
+    }
+
+    #[test]
+    fn a_module_alone_is_loose() {
+        let layout = infer(&image(&[table(600.0, 400.0, 1, 1)], 0.0, 0.0), None, &LayoutOptions::default());
+        assert_eq!(layout.loose, [0]);
+    }
+
+    proptest! {
+        #[test]
+        fn structure_does_not_depend_on_rotation_perspective_or_order(
+            turn in 0.0..360.0_f64, perspective in -0.15..0.15_f64, seed in any::<u64>(),
+        ) {
+            let mut hole = table(430.0, 380.0, 2, 9);
+            hole.missing = vec![(0, 3)];
+            let tables =
+                [table(400.0, 250.0, 3, 14), hole, table(430.0 + 220.5 + 8.0, 380.0, 2, 6), table(450.0, 560.0, 1, 12)];
+            let mut detections = image(&tables, turn, perspective);
+            let count = detections.detections.len() as u64;
+            // A fixed shuffle by the seed.
+            detections.detections.sort_by_key(|d| {
+                ((d.quad.center().x * 1e3) as u64 ^ seed).wrapping_mul(0x9E37_79B9_7F4A_7C15) % (count * 97)
+            });
+            let layout = infer(&detections, None, &LayoutOptions::default());
+            prop_assert_eq!(shapes(&layout), vec![(1, 12), (2, 6), (2, 9), (3, 14)]);
+            prop_assert_eq!(layout.gaps.len(), 2);
+            prop_assert!(layout.loose.is_empty());
+        }
+    }
+}

@@ -1,0 +1,239 @@
+//! `heliomap map`: a folder in, a plant out, no server.
+
+use anyhow::{Context, bail};
+use clap::Args;
+use heliomap::detection::Detector;
+use heliomap::overlay;
+use heliomap::pipeline::{self, Boxes, MapOptions, Observer, Stage, Subject};
+use heliomap::plant::{Layer, PlantId, PlantModel};
+use heliomap::refinement::Method;
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use serde_json::{Value, json};
+use std::io::IsTerminal;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex};
+
+/// Map the plant in a folder as OpenSfM leaves it.
+#[derive(Debug, Args)]
+#[command(after_help = "The folder holds reconstruction.json, reference_lla.json, images/ and, where there is one, \
+                        undistorted/ with images/ and depthmaps/merged.ply.\n\n\
+                        Example: heliomap map my-survey --out plant.geojson --overlay pictures --timings")]
+pub struct MapArgs {
+    /// Folder with the reconstruction and the images
+    folder: PathBuf,
+    /// GeoJSON file of all modules to write; sectors, benches and lines come beside it with `--layers`
+    #[arg(short, long, value_name = "FILE", default_value = "plant.geojson")]
+    out: PathBuf,
+    /// Write sectors, benches and lines too, as FILE-sectors.geojson and so on
+    #[arg(long)]
+    layers: bool,
+    /// Draw detections, rows, gaps, hypotheses and labels on the photos, and the plant from above, into this folder
+    #[arg(long, value_name = "DIR")]
+    overlay: Option<PathBuf>,
+    /// Take these boxes instead of searching the images (the form that detectors write)
+    #[arg(long, value_name = "FILE")]
+    detections: Option<PathBuf>,
+    /// Detector, an ONNX file
+    #[arg(long, env = "HELIOMAP_DETECTOR", value_name = "FILE", default_value = "models/unet.onnx")]
+    detector: PathBuf,
+    /// Threads to use; all cores where it is not given
+    #[arg(long, env = "HELIOMAP_THREADS", value_name = "N")]
+    threads: Option<usize>,
+    /// Name of the plant: the same name gives the same identifiers
+    #[arg(long, value_name = "NAME")]
+    plant: Option<String>,
+    /// Model of an earlier survey (the --model-out of that run), whose identifiers live on
+    #[arg(long, value_name = "FILE")]
+    previous: Option<PathBuf>,
+    /// Write the whole model as JSON, for --previous of the next survey
+    #[arg(long, value_name = "FILE")]
+    model_out: Option<PathBuf>,
+    /// Rows of modules per bench, if all have the same; inferred otherwise
+    #[arg(long, value_name = "N")]
+    rows_per_bench: Option<u32>,
+    /// Coarsest ground sampling distance of images to search, metres per pixel [default: 0.06]
+    #[arg(long, value_name = "M")]
+    max_gsd: Option<f64>,
+    /// Known spacing of module centres along and across the row in metres, for example 1.02,1.67: fixes the scale
+    #[arg(long, value_name = "ALONG,ACROSS", value_delimiter = ',', num_args = 2)]
+    spacing: Option<Vec<f64>>,
+    /// How positions are refined
+    #[arg(long, value_enum, default_value_t = MethodArg::Lattice)]
+    refinement: MethodArg,
+    /// Most megapixels that an image may have
+    #[arg(long, env = "HELIOMAP_MAX_MEGAPIXELS", value_name = "MP", default_value_t = 100)]
+    max_megapixels: u64,
+    /// Seed of every random choice
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Print seconds and peak memory of every stage
+    #[arg(long)]
+    timings: bool,
+    /// Print warnings and the summary as JSON on standard output
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Debug, Clone, Copy, clap::ValueEnum)]
+enum MethodArg {
+    /// The lattice of each bench from the pixels of all views
+    Lattice,
+    /// The paper's lines and uniform spacing (3.6)
+    Paper,
+}
+
+/// Runs the command.
+pub fn run(
+    args: &MapArgs,
+    open_detector: impl Fn(&Path, usize) -> anyhow::Result<Box<dyn Detector>>,
+) -> anyhow::Result<()> {
+    let cores = std::thread::available_parallelism().map_or(2, usize::from);
+    let threads = args.threads.unwrap_or(cores).max(1);
+    rayon::ThreadPoolBuilder::new().num_threads(threads).build_global().context("starting the threads")?;
+    let spacing_m = match args.spacing.as_deref() {
+        None => None,
+        Some(&[along, across]) => Some([along, across]),
+        Some(_) => bail!("--spacing takes two lengths in metres, along and across the row"),
+    };
+    let options = MapOptions {
+        rows_per_bench: args.rows_per_bench,
+        max_gsd_m_per_px: args.max_gsd,
+        spacing_m,
+        refinement: match args.refinement {
+            MethodArg::Lattice => Method::Lattice,
+            MethodArg::Paper => Method::Paper,
+        },
+        max_image_pixels: args.max_megapixels * 1_000_000,
+        seed: args.seed,
+    };
+    let folder_name = args.folder.canonicalize().ok().and_then(|f| Some(f.file_name()?.to_string_lossy().into_owned()));
+    let survey = folder_name.unwrap_or_else(|| args.folder.display().to_string());
+    let previous = args.previous.as_deref().map(read_model).transpose()?.map(Arc::new);
+    let plant_name = args
+        .plant
+        .clone()
+        .or_else(|| previous.as_ref().map(|model| model.plant_name.clone()))
+        .unwrap_or_else(|| survey.clone());
+    let plant = previous.as_ref().map_or_else(|| PlantId::from_name(&plant_name), |model| model.plant);
+    let subject = Subject { plant, plant_name, survey, previous };
+
+    let detector = match args.detections {
+        Some(_) => None,
+        None => Some(open_detector(&args.detector, threads)?),
+    };
+    let boxes = match (&args.detections, &detector) {
+        (Some(file), _) => Boxes::File(file),
+        (None, Some(detector)) => Boxes::Detector(detector.as_ref()),
+        (None, None) => bail!("neither a detector nor boxes were given"),
+    };
+    let report = Report::new();
+    let mapping = pipeline::map_folder(&args.folder, boxes, &options, &subject, &report)?;
+    report.finish();
+
+    let model = &mapping.model;
+    write_json(&args.out, &model.feature_collection(Layer::Modules))?;
+    if args.layers {
+        let stem = args.out.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        for layer in [Layer::Sectors, Layer::Benches, Layer::Lines] {
+            write_json(&args.out.with_file_name(format!("{stem}-{layer}.geojson")), &model.feature_collection(layer))?;
+        }
+    }
+    if let Some(path) = &args.model_out {
+        write_json(path, &serde_json::to_value(model)?)?;
+    }
+    if let Some(folder) = &args.overlay {
+        overlay::draw(&mapping, folder)?;
+    }
+    if args.json {
+        let summary = json!({
+            "modules": model.modules.len(), "sectors": model.sectors.len(), "benches": model.benches.len(),
+            "lines": model.lines.len(), "warnings": model.warnings, "out": args.out,
+            "timings": mapping.timings.iter().map(|t| json!({
+                "stage": t.stage.as_str(), "seconds": t.wall.as_secs_f64(), "peak_memory_bytes": t.peak_memory_bytes,
+            })).collect::<Vec<_>>(),
+        });
+        println!("{summary:#}");
+    } else {
+        for warning in &model.warnings {
+            println!("warning ({}): {}", warning.code, warning.message);
+        }
+        println!(
+            "{} modules in {} sectors, {} benches and {} lines: {}",
+            model.modules.len(),
+            model.sectors.len(),
+            model.benches.len(),
+            model.lines.len(),
+            args.out.display()
+        );
+    }
+    if args.timings {
+        eprintln!("{:<10} {:>9} {:>14}", "stage", "seconds", "peak memory");
+        for timing in &mapping.timings {
+            let memory = timing.peak_memory_bytes.map_or_else(|| "?".to_owned(), |b| format!("{} MB", b / 1_000_000));
+            eprintln!("{:<10} {:>9.3} {:>14}", timing.stage.as_str(), timing.wall.as_secs_f64(), memory);
+        }
+    }
+    Ok(())
+}
+
+/// Writes a file whole or not at all.
+fn write_json(path: &Path, value: &Value) -> anyhow::Result<()> {
+    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let what = || format!("writing {}", path.display());
+    std::fs::create_dir_all(folder).with_context(what)?;
+    let mut file = tempfile::NamedTempFile::new_in(folder).with_context(what)?;
+    serde_json::to_writer(std::io::BufWriter::new(&mut file), value).with_context(what)?;
+    let readable = std::os::unix::fs::PermissionsExt::from_mode(0o644);
+    file.as_file().set_permissions(readable).with_context(what)?;
+    file.persist(path).with_context(what)?;
+    Ok(())
+}
+
+fn read_model(path: &Path) -> anyhow::Result<PlantModel> {
+    let what = || format!("{} is no model that `heliomap map --model-out` wrote", path.display());
+    let file = std::fs::File::open(path).with_context(|| format!("reading {}", path.display()))?;
+    serde_json::from_reader(std::io::BufReader::new(file)).with_context(what)
+}
+
+/// A bar on a terminal, a line per tenth elsewhere.
+struct Report {
+    bar: Option<ProgressBar>,
+    last: Mutex<Option<(Stage, usize)>>,
+}
+
+impl Report {
+    fn new() -> Self {
+        let bar = std::io::stderr().is_terminal().then(|| {
+            let bar = ProgressBar::with_draw_target(Some(1), ProgressDrawTarget::stderr());
+            if let Ok(style) = ProgressStyle::with_template("{msg:<10} [{bar:40}] {pos}/{len} {elapsed}") {
+                bar.set_style(style.progress_chars("=> "));
+            }
+            bar
+        });
+        Self { bar, last: Mutex::new(None) }
+    }
+
+    fn finish(&self) {
+        if let Some(bar) = &self.bar {
+            bar.finish_and_clear();
+        }
+    }
+}
+
+impl Observer for Report {
+    fn progress(&self, stage: Stage, done: usize, total: usize) {
+        if let Some(bar) = &self.bar {
+            bar.set_message(stage.as_str());
+            bar.set_length(total as u64);
+            bar.set_position(done as u64);
+            return;
+        }
+        let tenth = if total == 0 { 10 } else { done * 10 / total };
+        if let Ok(mut last) = self.last.lock() {
+            if *last != Some((stage, tenth)) {
+                *last = Some((stage, tenth));
+                eprintln!("{}: {done} of {total}", stage.as_str());
+            }
+        }
+    }
+}
