@@ -5,6 +5,8 @@
 
 pub mod detection;
 pub mod geometry;
+pub mod jobs;
 pub mod pipeline;
 pub mod plant;
 pub mod reconstruction;
+pub mod store;
