@@ -3,12 +3,17 @@
 //! Each room may use what stands before it in this list, never what comes after: `geometry`, `reconstruction`,
 //! `detection`, `layout`, `fusion`, `refinement`, `plant`, `pipeline`; then `store` and `jobs`; then `http`.
 
+pub mod config;
 pub mod detection;
 pub mod fusion;
 pub mod geometry;
+pub mod http;
+pub mod jobs;
 pub mod layout;
 pub mod overlay;
 pub mod pipeline;
 pub mod plant;
 pub mod reconstruction;
 pub mod refinement;
+pub mod store;
+pub mod telemetry;

@@ -2,7 +2,7 @@
 
 use anyhow::{Context, bail};
 use clap::Args;
-use heliomap::detection::Detector;
+use heliomap::detection::Unet;
 use heliomap::overlay;
 use heliomap::pipeline::{self, Boxes, MapOptions, Observer, Stage, Subject};
 use heliomap::plant::{Layer, PlantId, PlantModel};
@@ -83,10 +83,7 @@ enum MethodArg {
 }
 
 /// Runs the command.
-pub fn run(
-    args: &MapArgs,
-    open_detector: impl Fn(&Path, usize) -> anyhow::Result<Box<dyn Detector>>,
-) -> anyhow::Result<()> {
+pub fn run(args: &MapArgs) -> anyhow::Result<()> {
     let cores = std::thread::available_parallelism().map_or(2, usize::from);
     let threads = args.threads.unwrap_or(cores).max(1);
     rayon::ThreadPoolBuilder::new().num_threads(threads).build_global().context("starting the threads")?;
@@ -119,11 +116,11 @@ pub fn run(
 
     let detector = match args.detections {
         Some(_) => None,
-        None => Some(open_detector(&args.detector, threads)?),
+        None => Some(Unet::open(&args.detector, threads)?),
     };
     let boxes = match (&args.detections, &detector) {
         (Some(file), _) => Boxes::File(file),
-        (None, Some(detector)) => Boxes::Detector(detector.as_ref()),
+        (None, Some(detector)) => Boxes::Detector(detector),
         (None, None) => bail!("neither a detector nor boxes were given"),
     };
     let report = Report::new();

@@ -1,0 +1,76 @@
+//! One file per command. Here alone, concrete backends are named.
+
+pub mod map;
+pub mod openapi;
+pub mod serve;
+pub mod worker;
+
+use anyhow::Context;
+use heliomap::config::{DetectorArgs, StorageArgs};
+use heliomap::detection::{DetectionError, Detector, Unet};
+use heliomap::jobs::{PipelineMapper, Worker, WorkerSettings};
+use heliomap::store::{Blobs, SqliteStore, Store};
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::sync::Notify;
+use tokio_util::sync::CancellationToken;
+
+/// What a crash left among the uploads is deleted after this time.
+const STALE_UPLOADS: Duration = Duration::from_secs(24 * 3600);
+
+/// How long work in progress may take to end once the process was told to stop.
+const GRACE: Duration = Duration::from_secs(20);
+
+/// The database and the blobs of a data folder.
+async fn open_storage(args: &StorageArgs) -> anyhow::Result<(Arc<dyn Store>, Blobs)> {
+    let folder = &args.data_dir;
+    let hint = || format!("cannot use the data folder {}; choose another with --data-dir", folder.display());
+    let blobs = Blobs::in_folder(folder).with_context(hint)?;
+    blobs.sweep_staging(STALE_UPLOADS).await.with_context(hint)?;
+    let store = SqliteStore::open(&folder.join("heliomap.db")).await.with_context(hint)?;
+    Ok((Arc::new(store), blobs))
+}
+
+/// A worker that runs the pipeline.
+fn pipeline_worker(store: Arc<dyn Store>, blobs: Blobs, detector: DetectorArgs, bell: Arc<Notify>) -> Worker {
+    Worker {
+        name: format!("{}-{}", std::process::id(), &uuid::Uuid::new_v4().simple().to_string()[..8]),
+        store,
+        blobs,
+        mapper: Arc::new(PipelineMapper::new(Box::new(move || open_detector(&detector.detector)))),
+        settings: WorkerSettings::default(),
+        bell,
+    }
+}
+
+/// The detector of an ONNX file.
+fn open_detector(path: &Path) -> Result<Arc<dyn Detector>, DetectionError> {
+    let threads = std::thread::available_parallelism().map_or(2, usize::from);
+    Ok(Arc::new(Unet::open(path, threads)?))
+}
+
+/// Runs a service until its end; what then still runs is given a moment and left behind.
+fn run_async(service: impl Future<Output = anyhow::Result<()>>) -> anyhow::Result<()> {
+    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
+    let outcome = runtime.block_on(service);
+    runtime.shutdown_timeout(Duration::from_secs(1));
+    outcome
+}
+
+/// Is cancelled when the process is told to stop.
+fn stop_signal() -> anyhow::Result<CancellationToken> {
+    use tokio::signal::unix::{SignalKind, signal};
+    let stop = CancellationToken::new();
+    let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
+    let raised = stop.clone();
+    tokio::spawn(async move {
+        tokio::select! {
+            _ = terminate.recv() => {}
+            _ = interrupt.recv() => {}
+        }
+        tracing::info!("stopping");
+        raised.cancel();
+    });
+    Ok(stop)
+}

@@ -1,0 +1,157 @@
+//! The command line: flags, each with an environment variable, parsed once.
+
+use clap::{Args, ValueEnum};
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::time::Duration;
+
+/// What is logged, to standard error.
+#[derive(Debug, Clone, Args)]
+pub struct LogArgs {
+    /// Which events are logged: error, warn, info, debug, trace, or directives such as `heliomap=debug,warn`.
+    #[arg(long, env = "HELIOMAP_LOG", default_value = "info", global = true, value_name = "FILTER")]
+    pub log: String,
+    /// How they are written.
+    #[arg(long, env = "HELIOMAP_LOG_FORMAT", value_enum, default_value = "pretty", global = true)]
+    pub log_format: LogFormat,
+}
+
+/// How events are written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum LogFormat {
+    /// A line for people.
+    Pretty,
+    /// A JSON object per line.
+    Json,
+}
+
+/// `heliomap serve`.
+#[derive(Debug, Clone, Args)]
+pub struct ServeArgs {
+    /// Address and port to listen on; port 0 takes a free one, which is printed.
+    #[arg(long, env = "HELIOMAP_LISTEN", default_value = "127.0.0.1:8080", value_name = "ADDRESS")]
+    pub listen: SocketAddr,
+    /// Run no jobs in this process; leave them to `heliomap worker`.
+    #[arg(long, env = "HELIOMAP_NO_WORKER")]
+    pub no_worker: bool,
+    #[command(flatten)]
+    pub storage: StorageArgs,
+    #[command(flatten)]
+    pub detector: DetectorArgs,
+    #[command(flatten)]
+    pub limits: Limits,
+}
+
+/// `heliomap worker`.
+#[derive(Debug, Clone, Args)]
+pub struct WorkerArgs {
+    #[command(flatten)]
+    pub storage: StorageArgs,
+    #[command(flatten)]
+    pub detector: DetectorArgs,
+}
+
+/// `heliomap openapi`.
+#[derive(Debug, Clone, Args)]
+pub struct OpenapiArgs {
+    /// Print JSON instead of YAML.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Where the service keeps what it remembers.
+#[derive(Debug, Clone, Args)]
+pub struct StorageArgs {
+    /// Folder of the database and the uploaded files; created where it is missing.
+    #[arg(long, env = "HELIOMAP_DATA_DIR", default_value = "heliomap-data", value_name = "DIR")]
+    pub data_dir: PathBuf,
+}
+
+/// What finds modules in photos.
+#[derive(Debug, Clone, Args)]
+pub struct DetectorArgs {
+    /// The detector's ONNX file.
+    #[arg(long, env = "HELIOMAP_DETECTOR", default_value = "models/unet.onnx", value_name = "FILE")]
+    pub detector: PathBuf,
+}
+
+/// How much one client may ask for. Sizes take the endings K, M, G and T (powers of 1024).
+#[derive(Debug, Clone, Args)]
+#[command(next_help_heading = "Limits")]
+pub struct Limits {
+    /// Largest image file.
+    #[arg(long, env = "HELIOMAP_MAX_IMAGE_SIZE", default_value = "256M", value_parser = parse_size, value_name = "SIZE")]
+    pub max_image_size: u64,
+    /// Largest image, in millions of pixels; checked before an image is decoded.
+    #[arg(long, env = "HELIOMAP_MAX_IMAGE_MEGAPIXELS", default_value_t = 100.0, value_name = "MP")]
+    pub max_image_megapixels: f64,
+    /// Largest single file of a reconstruction.
+    #[arg(long, env = "HELIOMAP_MAX_FILE_SIZE", default_value = "8G", value_parser = parse_size, value_name = "SIZE")]
+    pub max_file_size: u64,
+    /// Largest zip or tar.
+    #[arg(long, env = "HELIOMAP_MAX_ARCHIVE_SIZE", default_value = "16G", value_parser = parse_size, value_name = "SIZE")]
+    pub max_archive_size: u64,
+    /// Largest sum of the files in a zip or tar.
+    #[arg(long, env = "HELIOMAP_MAX_UNPACKED_SIZE", default_value = "64G", value_parser = parse_size, value_name = "SIZE")]
+    pub max_unpacked_size: u64,
+    /// How many times as large as the zip or tar its files may be, from 64 MiB on.
+    #[arg(long, env = "HELIOMAP_MAX_UNPACKED_RATIO", default_value_t = 50, value_name = "TIMES")]
+    pub max_unpacked_ratio: u64,
+    /// Most entries in a zip or tar, and most images in one multipart upload.
+    #[arg(long, env = "HELIOMAP_MAX_ENTRIES", default_value_t = 20_000, value_name = "COUNT")]
+    pub max_entries: usize,
+    /// How long an upload may stand still, and any other request may take, in seconds.
+    #[arg(long, env = "HELIOMAP_REQUEST_TIMEOUT", default_value = "30", value_parser = parse_seconds, value_name = "SECONDS")]
+    pub request_timeout: Duration,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self {
+            max_image_size: 256 << 20,
+            max_image_megapixels: 100.0,
+            max_file_size: 8 << 30,
+            max_archive_size: 16 << 30,
+            max_unpacked_size: 64 << 30,
+            max_unpacked_ratio: 50,
+            max_entries: 20_000,
+            request_timeout: Duration::from_secs(30),
+        }
+    }
+}
+
+fn parse_size(text: &str) -> Result<u64, String> {
+    let digits = text.trim_end_matches(|c: char| !c.is_ascii_digit());
+    let shift = match text[digits.len()..].trim().to_ascii_uppercase().trim_end_matches("IB").trim_end_matches('B') {
+        "" => 0,
+        "K" => 10,
+        "M" => 20,
+        "G" => 30,
+        "T" => 40,
+        _ => return Err("a size is a whole number with K, M, G or T behind it, such as 256M".to_owned()),
+    };
+    let number: u64 = digits.parse().map_err(|_| "a size begins with a whole number, such as 256M".to_owned())?;
+    number.checked_mul(1 << shift).ok_or_else(|| "the size is too large".to_owned())
+}
+
+fn parse_seconds(text: &str) -> Result<Duration, String> {
+    let seconds = text.parse::<f64>().map_err(|_| "a number of seconds is expected".to_owned())?;
+    match Duration::try_from_secs_f64(seconds) {
+        Ok(duration) if !duration.is_zero() => Ok(duration),
+        _ => Err("a positive number of seconds is expected".to_owned()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    #[test]
+    fn sizes() {
+        assert_eq!(parse_size("256M"), Ok(256 << 20));
+        assert_eq!(parse_size("8 GiB"), Ok(8 << 30));
+        assert_eq!(parse_size("17"), Ok(17));
+        assert!(parse_size("M").is_err());
+        assert!(parse_size("12X").is_err());
+        assert!(parse_size("99999999999T").is_err());
+    }
+}

@@ -1,0 +1,215 @@
+//! What is said when something does not work: RFC 9457 problem documents with a stable code.
+
+use crate::store::{InvalidPath, StoreError};
+use axum::Json;
+use axum::http::{HeaderValue, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use serde::Serialize;
+use serde_json::{Map, Value};
+use std::borrow::Cow;
+
+/// The media type of a problem document.
+pub const PROBLEM_JSON: &str = "application/problem+json";
+
+macro_rules! codes {
+    ($($(#[$doc:meta])* $name:ident = $status:ident, $code:literal, $title:literal;)*) => {
+        /// Every kind of problem, with its status, its stable word and its title.
+        #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+        pub enum Code {
+            $($(#[$doc])* $name,)*
+        }
+
+        impl Code {
+            /// All kinds.
+            pub const ALL: &[Self] = &[$(Self::$name),*];
+
+            /// Status, word and title.
+            pub fn parts(self) -> (StatusCode, &'static str, &'static str) {
+                match self {
+                    $(Self::$name => (StatusCode::$status, $code, $title),)*
+                }
+            }
+        }
+    };
+}
+
+codes! {
+    BadRequest = BAD_REQUEST, "bad_request", "The request cannot be read";
+    InvalidQuery = BAD_REQUEST, "invalid_query", "A query parameter is wrong";
+    InvalidJson = BAD_REQUEST, "invalid_json", "The body is no JSON";
+    UploadInterrupted = BAD_REQUEST, "upload_interrupted", "The upload ended early";
+    NotFound = NOT_FOUND, "not_found", "There is nothing here";
+    PlantNotFound = NOT_FOUND, "plant_not_found", "There is no such plant";
+    SurveyNotFound = NOT_FOUND, "survey_not_found", "There is no such survey";
+    JobNotFound = NOT_FOUND, "job_not_found", "There is no such job";
+    ModelNotFound = NOT_FOUND, "model_not_found", "There is no such model";
+    ModuleNotFound = NOT_FOUND, "module_not_found", "There is no such module";
+    MethodNotAllowed = METHOD_NOT_ALLOWED, "method_not_allowed", "The method does not apply here";
+    Timeout = REQUEST_TIMEOUT, "timeout", "The request took too long";
+    UploadStalled = REQUEST_TIMEOUT, "upload_stalled", "The upload stood still";
+    SurveyIncomplete = CONFLICT, "survey_incomplete", "The survey cannot be mapped yet";
+    JobFinished = CONFLICT, "job_finished", "The job has ended";
+    JobStopping = CONFLICT, "job_stopping", "The survey's cancelled job has not stopped yet";
+    TooLarge = PAYLOAD_TOO_LARGE, "too_large", "The upload is too large";
+    ArchiveTooLarge = PAYLOAD_TOO_LARGE, "archive_too_large", "The archive unpacks to too much";
+    ImageTooLarge = PAYLOAD_TOO_LARGE, "image_too_large", "The image has too many pixels";
+    UnsupportedMediaType = UNSUPPORTED_MEDIA_TYPE, "unsupported_media_type", "The body's media type does not apply here";
+    UnsupportedArchive = UNSUPPORTED_MEDIA_TYPE, "unsupported_archive", "The body is no zip or tar";
+    InvalidName = UNPROCESSABLE_ENTITY, "invalid_name", "The name cannot be used";
+    InvalidFields = UNPROCESSABLE_ENTITY, "invalid_fields", "The document has the wrong fields";
+    UnknownFile = UNPROCESSABLE_ENTITY, "unknown_file", "The file is no part of a reconstruction";
+    ImageFormatMismatch = UNPROCESSABLE_ENTITY, "image_format_mismatch", "The image is not what its name says";
+    ImageUnreadable = UNPROCESSABLE_ENTITY, "image_unreadable", "The file is no image that can be read";
+    ImageTruncated = UNPROCESSABLE_ENTITY, "image_truncated", "The image is cut short";
+    FileUnreadable = UNPROCESSABLE_ENTITY, "file_unreadable", "The file does not hold what its name says";
+    FilesRefused = UNPROCESSABLE_ENTITY, "files_refused", "Some files were refused";
+    ArchiveUnsafe = UNPROCESSABLE_ENTITY, "archive_unsafe", "The archive holds entries that no archive should";
+    ArchiveUnreadable = UNPROCESSABLE_ENTITY, "archive_unreadable", "The archive cannot be read";
+    ArchiveEmpty = UNPROCESSABLE_ENTITY, "archive_empty", "The archive holds no file of a survey";
+    Internal = INTERNAL_SERVER_ERROR, "internal_error", "The service failed";
+    Unavailable = SERVICE_UNAVAILABLE, "unavailable", "The service is not ready";
+    StorageFull = INSUFFICIENT_STORAGE, "storage_full", "The service's storage is full";
+}
+
+/// A request that cannot be fulfilled, as the client hears of it.
+#[derive(Debug, Clone)]
+pub struct ApiError {
+    pub code: Code,
+    /// What does not work and what to do.
+    pub detail: Cow<'static, str>,
+    /// Further members of the document.
+    pub members: Map<String, Value>,
+    pub retry_after_s: Option<u64>,
+}
+
+impl ApiError {
+    /// A problem of a kind; `detail` says what does not work and what to do.
+    pub fn new(code: Code, detail: impl Into<Cow<'static, str>>) -> Self {
+        Self { code, detail: detail.into(), members: Map::new(), retry_after_s: None }
+    }
+
+    /// Adds a member to the document.
+    pub fn with(mut self, name: &str, value: impl Serialize) -> Self {
+        self.members.insert(name.to_owned(), serde_json::json!(value));
+        self
+    }
+
+    /// Says when to try again.
+    pub fn retry_after(mut self, seconds: u64) -> Self {
+        self.retry_after_s = Some(seconds);
+        self
+    }
+
+    /// A fault of the service: logged here, once, and not told.
+    pub fn internal(error: &dyn std::error::Error) -> Self {
+        tracing::error!(error = %chain(error), "request failed");
+        Self::new(
+            Code::Internal,
+            "this is a fault of the service; its log tells more under the x-request-id of this response",
+        )
+    }
+
+    /// The problem document.
+    pub fn document(&self) -> Value {
+        let (status, code, title) = self.code.parts();
+        let mut document = Map::new();
+        document.insert("type".to_owned(), format!("urn:heliomap:problem:{code}").into());
+        document.insert("title".to_owned(), title.into());
+        document.insert("status".to_owned(), status.as_u16().into());
+        document.insert("code".to_owned(), code.into());
+        document.insert("detail".to_owned(), self.detail.as_ref().into());
+        document.extend(self.members.clone());
+        Value::Object(document)
+    }
+}
+
+impl IntoResponse for ApiError {
+    fn into_response(self) -> Response {
+        let mut response = (self.code.parts().0, Json(self.document())).into_response();
+        response.headers_mut().insert(header::CONTENT_TYPE, HeaderValue::from_static(PROBLEM_JSON));
+        if let Some(seconds) = self.retry_after_s {
+            response.headers_mut().insert(header::RETRY_AFTER, HeaderValue::from(seconds));
+        }
+        response
+    }
+}
+
+impl From<StoreError> for ApiError {
+    fn from(error: StoreError) -> Self {
+        match &error {
+            StoreError::Gone { what: "plant" } => Self::new(Code::PlantNotFound, "the plant was deleted meanwhile"),
+            StoreError::Gone { .. } => Self::new(Code::SurveyNotFound, "the survey was deleted meanwhile"),
+            error if error.is_full() => {
+                tracing::error!(%error, "storage is full");
+                Self::new(Code::StorageFull, "nothing of this request was stored; make room, then send it again")
+                    .retry_after(60)
+            }
+            error => Self::internal(error),
+        }
+    }
+}
+
+impl From<InvalidPath> for ApiError {
+    fn from(error: InvalidPath) -> Self {
+        let code = match error {
+            InvalidPath::Name { .. } => Code::InvalidName,
+            InvalidPath::Unknown { .. } => Code::UnknownFile,
+        };
+        Self::new(code, error.to_string())
+    }
+}
+
+/// An error with all that caused it.
+fn chain(error: &dyn std::error::Error) -> String {
+    let mut text = error.to_string();
+    let mut source = error.source();
+    while let Some(cause) = source {
+        let cause_text = cause.to_string();
+        if !text.contains(&cause_text) {
+            text.push_str(": ");
+            text.push_str(&cause_text);
+        }
+        source = cause.source();
+    }
+    text
+}
+
+/// A problem document (RFC 9457). Further members depend on the code.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub struct Problem {
+    /// A URN that ends in the code.
+    #[schema(example = "urn:heliomap:problem:plant_not_found")]
+    pub r#type: String,
+    pub title: String,
+    pub status: u16,
+    /// A stable word to tell problems apart by.
+    #[schema(example = "plant_not_found")]
+    pub code: String,
+    /// What does not work and what to do, for people.
+    pub detail: String,
+}
+
+/// The same document on every error, wherever it arose: what the framework answered with plain text becomes a problem.
+pub async fn only_problems(response: Response) -> Response {
+    let status = response.status();
+    let is_problem = response.headers().get(header::CONTENT_TYPE).is_some_and(|kind| kind == PROBLEM_JSON);
+    if !(status.is_client_error() || status.is_server_error()) || is_problem {
+        return response;
+    }
+    let (code, detail) = match status {
+        StatusCode::NOT_FOUND => (Code::NotFound, "see /openapi.yaml for what this service offers"),
+        StatusCode::METHOD_NOT_ALLOWED => (Code::MethodNotAllowed, "the header `allow` names the methods that do"),
+        StatusCode::REQUEST_TIMEOUT => (Code::Timeout, "send it again; ask for less at once where that fails too"),
+        StatusCode::PAYLOAD_TOO_LARGE => (Code::TooLarge, "send less at once"),
+        StatusCode::UNSUPPORTED_MEDIA_TYPE => (Code::UnsupportedMediaType, "see /openapi.yaml for what is expected"),
+        status if status.is_client_error() => (Code::BadRequest, "see /openapi.yaml for what is expected"),
+        _ => (Code::Internal, "this is a fault of the service"),
+    };
+    let mut problem = ApiError::new(code, detail).into_response();
+    for (name, value) in response.headers() {
+        if name != header::CONTENT_TYPE && name != header::CONTENT_LENGTH {
+            problem.headers_mut().insert(name, value.clone());
+        }
+    }
+    problem
+}

@@ -1,0 +1,44 @@
+//! Whether the service runs.
+
+use super::AppState;
+use super::error::{ApiError, Code, Problem};
+use axum::Json;
+use axum::extract::State;
+use serde::Serialize;
+
+/// How the service is.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub struct Health {
+    #[schema(example = "ok")]
+    pub status: &'static str,
+    /// The version of the program.
+    pub version: &'static str,
+}
+
+const FINE: Health = Health { status: "ok", version: env!("CARGO_PKG_VERSION") };
+
+/// Whether the process runs
+#[utoipa::path(get, path = "/health", tag = "operation", responses((status = 200, body = Health)))]
+pub async fn health() -> Json<Health> {
+    Json(FINE)
+}
+
+/// Whether database and blob store answer
+#[utoipa::path(
+    get,
+    path = "/ready",
+    tag = "operation",
+    responses(
+        (status = 200, body = Health),
+        (status = 503, description = "`unavailable`", body = Problem, content_type = "application/problem+json")
+    )
+)]
+pub async fn ready(State(state): State<AppState>) -> Result<Json<Health>, ApiError> {
+    for answer in [state.store.ping().await, state.blobs.ping().await] {
+        if let Err(error) = answer {
+            tracing::error!(%error, "not ready");
+            return Err(ApiError::new(Code::Unavailable, "the service's storage does not answer").retry_after(5));
+        }
+    }
+    Ok(Json(FINE))
+}

@@ -1,0 +1,313 @@
+//! Zip and tar archives from people one does not know: every entry is looked at before the first is unpacked, and no
+//! entry decides where anything is written.
+
+use crate::config::Limits;
+use crate::store::{Digest, InvalidPath, StagedFile, SurveyPath};
+use sha2::Digest as _;
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{self, BufReader, BufWriter, Read, Seek, SeekFrom, Write};
+use std::path::Path;
+
+/// Below this, an archive may unpack to any multiple of its size.
+const RATIO_FLOOR: u64 = 64 << 20;
+/// How many ignored entries are named.
+const MAX_NAMED: usize = 20;
+const CHUNK: usize = 128 << 10;
+
+/// Why an archive is refused.
+#[derive(Debug, thiserror::Error)]
+pub enum ArchiveError {
+    #[error("the body begins as neither a zip, a tar nor a gzipped tar")]
+    Unknown,
+    #[error("the archive cannot be read: {0}; make it again")]
+    Unreadable(String),
+    #[error("the entry `{entry}` {what}; make an archive of plain files with relative paths")]
+    Unsafe { entry: String, what: &'static str },
+    #[error("the archive {what}; send the files of one reconstruction and nothing else, or ask for a higher limit")]
+    TooLarge { what: String },
+    #[error("the entry `{entry}` cannot be placed in a survey: {reason}")]
+    Name { entry: String, reason: &'static str },
+    #[error("two entries are both {path}; leave one of them out")]
+    Twice { path: SurveyPath },
+    #[error(
+        "none of its {entries} entries is a file of a reconstruction; expected are reconstruction.json, \
+         reference_lla.json, undistorted/… and images/… as OpenSfM leaves them"
+    )]
+    NothingKnown { entries: usize },
+    /// The service's own disk failed.
+    #[error(transparent)]
+    Disk(io::Error),
+}
+
+/// What an archive held.
+#[derive(Debug)]
+pub struct Unpacked {
+    pub files: Vec<(SurveyPath, StagedFile)>,
+    /// Entries that belong to no survey, the first few by name.
+    pub ignored: Vec<String>,
+    pub ignored_count: usize,
+}
+
+/// Unpacks the files of a survey from an archive into files of their own in `folder`.
+pub fn unpack(archive: &Path, folder: &Path, limits: &Limits) -> Result<Unpacked, ArchiveError> {
+    let size = std::fs::metadata(archive).map_err(ArchiveError::Disk)?.len();
+    let budget = limits.max_unpacked_size.min(size.saturating_mul(limits.max_unpacked_ratio).max(RATIO_FLOOR));
+    let reader = Reader { file: archive, budget, max_entries: limits.max_entries };
+
+    let mut names = Vec::new();
+    reader.each(&mut |name, _| {
+        names.push(name.to_owned());
+        Ok(())
+    })?;
+    let places = places(&names)?;
+    if places.is_empty() {
+        return Err(ArchiveError::NothingKnown { entries: names.len() });
+    }
+    let mut unpacked = Unpacked { files: Vec::new(), ignored: Vec::new(), ignored_count: 0 };
+    let mut index = 0;
+    reader.each(&mut |name, content| {
+        match places.get(&index) {
+            Some(place) => unpacked.files.push((place.clone(), stage(content, folder)?)),
+            None => {
+                unpacked.ignored_count += 1;
+                if unpacked.ignored.len() < MAX_NAMED {
+                    unpacked.ignored.push(name.to_owned());
+                }
+            }
+        }
+        index += 1;
+        Ok(())
+    })?;
+    Ok(unpacked)
+}
+
+/// Which entries are files of a survey, by their index. An archive may hold the folder itself or what is in it, so a
+/// folder above the known paths is passed over; where there are several, the one nearest the top counts.
+fn places(names: &[String]) -> Result<BTreeMap<usize, SurveyPath>, ArchiveError> {
+    let mut found: Vec<(&str, usize, SurveyPath)> = Vec::new();
+    for (index, name) in names.iter().enumerate() {
+        let starts = std::iter::once(0).chain(name.match_indices('/').map(|(at, _)| at + 1));
+        for start in starts {
+            match SurveyPath::parse(&name[start..]) {
+                Ok(place) => {
+                    found.push((&name[..start], index, place));
+                    break;
+                }
+                // A photo whose name cannot be used: say so rather than leave it out.
+                Err(InvalidPath::Name { name: photo, reason }) if !photo.contains('/') && looks_like_photo(&photo) => {
+                    return Err(ArchiveError::Name { entry: shown(name), reason });
+                }
+                Err(_) => {}
+            }
+        }
+    }
+    let Some(base) = found.iter().map(|(base, ..)| *base).min_by_key(|base| (base.matches('/').count(), *base)) else {
+        return Ok(BTreeMap::new());
+    };
+    let mut places = BTreeMap::new();
+    let mut taken = std::collections::BTreeSet::new();
+    for (_, index, place) in found.iter().filter(|(prefix, ..)| *prefix == base) {
+        if !taken.insert(place) {
+            return Err(ArchiveError::Twice { path: place.clone() });
+        }
+        places.insert(*index, place.clone());
+    }
+    Ok(places)
+}
+
+/// Whether a file has an image's ending and is none of the hidden files that systems put beside photos.
+fn looks_like_photo(name: &str) -> bool {
+    let name = name.to_ascii_lowercase();
+    !name.starts_with('.') && [".jpg", ".jpeg", ".png", ".tif", ".tiff"].iter().any(|ending| name.ends_with(ending))
+}
+
+/// What is done with the name and the bytes of each regular file.
+type Visit<'a> = &'a mut dyn FnMut(&str, &mut dyn Read) -> Result<(), ArchiveError>;
+
+struct Reader<'a> {
+    file: &'a Path,
+    /// Bytes that may come out of it.
+    budget: u64,
+    max_entries: usize,
+}
+
+impl Reader<'_> {
+    /// Visits every regular file in the order of the archive; refuses links, devices and names that lead elsewhere.
+    fn each(&self, visit: Visit<'_>) -> Result<(), ArchiveError> {
+        let mut file = File::open(self.file).map_err(ArchiveError::Disk)?;
+        let mut head = Vec::new();
+        Read::by_ref(&mut file).take(512).read_to_end(&mut head).map_err(ArchiveError::Disk)?;
+        file.seek(SeekFrom::Start(0)).map_err(ArchiveError::Disk)?;
+        let file = BufReader::with_capacity(CHUNK, file);
+        match head.as_slice() {
+            [b'P', b'K', 3, 4, ..] | [b'P', b'K', 5, 6, ..] => self.each_of_zip(file, visit),
+            [0x1f, 0x8b, ..] => self.each_of_tar(flate2::read::MultiGzDecoder::new(file), visit),
+            head if head.get(257..262) == Some(b"ustar".as_slice()) => self.each_of_tar(file, visit),
+            _ => Err(ArchiveError::Unknown),
+        }
+    }
+
+    fn each_of_zip(&self, file: BufReader<File>, visit: Visit<'_>) -> Result<(), ArchiveError> {
+        let mut archive = zip::ZipArchive::new(file).map_err(zip_error)?;
+        if archive.len() > self.max_entries {
+            return Err(self.too_many());
+        }
+        let mut left = self.budget;
+        for index in 0..archive.len() {
+            let mut entry = archive.by_index(index).map_err(zip_error)?;
+            let name = entry.name().map_err(zip_error)?.into_owned();
+            check_name(&name)?;
+            if entry.is_symlink() {
+                return Err(unsafe_entry(&name, "is a link"));
+            }
+            if entry.is_dir() {
+                continue;
+            }
+            if entry.encrypted() {
+                return Err(unsafe_entry(&name, "is encrypted"));
+            }
+            // What the entry says of its size is checked here, what really comes out of it below.
+            if entry.size() > left {
+                return Err(self.too_much());
+            }
+            let mut bounded = Bounded { inner: &mut entry, left: &mut left, exceeded: false };
+            let visited = visit(&name, &mut bounded);
+            if bounded.exceeded {
+                return Err(self.too_much());
+            }
+            visited?;
+        }
+        Ok(())
+    }
+
+    fn each_of_tar(&self, file: impl Read, visit: Visit<'_>) -> Result<(), ArchiveError> {
+        let mut left = self.budget;
+        let mut bounded = Bounded { inner: file, left: &mut left, exceeded: false };
+        let mut archive = tar::Archive::new(&mut bounded);
+        let outcome = self.each_of_entries(&mut archive, visit);
+        if bounded.exceeded {
+            return Err(self.too_much());
+        }
+        outcome
+    }
+
+    fn each_of_entries<R: Read>(&self, archive: &mut tar::Archive<R>, visit: Visit<'_>) -> Result<(), ArchiveError> {
+        for (index, entry) in archive.entries().map_err(read_error)?.enumerate() {
+            if index >= self.max_entries {
+                return Err(self.too_many());
+            }
+            let mut entry = entry.map_err(read_error)?;
+            let name = String::from_utf8(entry.path_bytes().into_owned()).map_err(|error| {
+                unsafe_entry(&String::from_utf8_lossy(error.as_bytes()), "has a name that is no UTF-8")
+            })?;
+            let name = name.strip_prefix("./").unwrap_or(&name).to_owned();
+            let kind = entry.header().entry_type();
+            if kind.is_dir() {
+                if !name.is_empty() {
+                    check_name(&name)?;
+                }
+                continue;
+            }
+            if kind.is_pax_global_extensions() {
+                continue;
+            }
+            check_name(&name)?;
+            if kind.is_symlink() || kind.is_hard_link() {
+                return Err(unsafe_entry(&name, "is a link"));
+            }
+            if !kind.is_file() {
+                return Err(unsafe_entry(&name, "is no plain file"));
+            }
+            visit(&name, &mut entry)?;
+        }
+        Ok(())
+    }
+
+    fn too_many(&self) -> ArchiveError {
+        ArchiveError::TooLarge { what: format!("has more than {} entries", self.max_entries) }
+    }
+
+    fn too_much(&self) -> ArchiveError {
+        ArchiveError::TooLarge { what: format!("unpacks to more than {} bytes", self.budget) }
+    }
+}
+
+/// Refuses names that lead out of the folder that they are unpacked in, on any system.
+fn check_name(name: &str) -> Result<(), ArchiveError> {
+    if name.is_empty() || name.contains('\0') {
+        return Err(unsafe_entry(name, "has no usable name"));
+    }
+    let drive = name.as_bytes().get(1) == Some(&b':');
+    if name.starts_with('/') || name.starts_with('\\') || drive {
+        return Err(unsafe_entry(name, "has an absolute path"));
+    }
+    if name.split(['/', '\\']).any(|part| part == "..") {
+        return Err(unsafe_entry(name, "has `..` in its path"));
+    }
+    Ok(())
+}
+
+fn unsafe_entry(name: &str, what: &'static str) -> ArchiveError {
+    ArchiveError::Unsafe { entry: shown(name), what }
+}
+
+/// A name as it may be shown.
+fn shown(name: &str) -> String {
+    name.chars().take(120).map(|c| if c.is_control() { '\u{fffd}' } else { c }).collect()
+}
+
+fn zip_error(error: zip::result::ZipError) -> ArchiveError {
+    ArchiveError::Unreadable(error.to_string())
+}
+
+fn read_error(error: io::Error) -> ArchiveError {
+    ArchiveError::Unreadable(error.to_string())
+}
+
+/// Copies an entry to a file of its own.
+fn stage(content: &mut dyn Read, folder: &Path) -> Result<StagedFile, ArchiveError> {
+    let (file, path) =
+        tempfile::Builder::new().prefix("unpacked-").tempfile_in(folder).map_err(ArchiveError::Disk)?.into_parts();
+    let mut writer = BufWriter::with_capacity(CHUNK, file);
+    let mut hasher = sha2::Sha256::new();
+    let mut buffer = vec![0; CHUNK];
+    let mut size = 0;
+    loop {
+        let count = match content.read(&mut buffer) {
+            Ok(0) => break,
+            Ok(count) => count,
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
+            Err(error) => return Err(read_error(error)),
+        };
+        hasher.update(&buffer[..count]);
+        writer.write_all(&buffer[..count]).map_err(ArchiveError::Disk)?;
+        size += count as u64;
+    }
+    let file = writer.into_inner().map_err(|error| ArchiveError::Disk(error.into_error()))?;
+    file.sync_all().map_err(ArchiveError::Disk)?;
+    Ok(StagedFile { path, size, sha256: Digest(hasher.finalize().into()) })
+}
+
+/// A reader that gives no more than is left.
+struct Bounded<'a, R> {
+    inner: R,
+    left: &'a mut u64,
+    exceeded: bool,
+}
+
+impl<R: Read> Read for Bounded<'_, R> {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        let count = self.inner.read(buffer)?;
+        match self.left.checked_sub(count as u64) {
+            Some(left) => {
+                *self.left = left;
+                Ok(count)
+            }
+            None => {
+                self.exceeded = true;
+                Err(io::Error::other("more than it may hold"))
+            }
+        }
+    }
+}

@@ -1,0 +1,160 @@
+//! The structure of a JPEG file, read without decoding it: its size in pixels, and whether it is whole.
+
+use std::io::{self, BufRead, ErrorKind};
+
+/// What is wrong with a JPEG file.
+#[derive(Debug, thiserror::Error)]
+pub enum JpegError {
+    /// It ends before its end-of-image marker.
+    #[error("it ends before its end-of-image marker")]
+    CutShort,
+    /// A marker or segment where none can be.
+    #[error("{0}")]
+    Malformed(&'static str),
+    #[error(transparent)]
+    Io(io::Error),
+}
+
+impl From<io::Error> for JpegError {
+    fn from(error: io::Error) -> Self {
+        if error.kind() == ErrorKind::UnexpectedEof { Self::CutShort } else { Self::Io(error) }
+    }
+}
+
+const START_OF_IMAGE: u8 = 0xd8;
+const END_OF_IMAGE: u8 = 0xd9;
+const START_OF_SCAN: u8 = 0xda;
+
+/// Width and height of a JPEG that is whole: every segment and scan up to the first end-of-image marker. What follows
+/// (previews that cameras append) is not looked at. `limit` may end the walk as soon as the size is known.
+pub fn walk(mut file: impl BufRead, limit: impl Fn([u32; 2]) -> bool) -> Result<[u32; 2], JpegError> {
+    let mut start = [0; 2];
+    file.read_exact(&mut start)?;
+    if start != [0xff, START_OF_IMAGE] {
+        return Err(JpegError::Malformed("it does not begin as a JPEG"));
+    }
+    let mut size_px = None;
+    let mut scans = 0_u32;
+    let mut marker = next_marker(&mut file, false)?;
+    loop {
+        match marker {
+            END_OF_IMAGE => break,
+            0x01 | 0xd0..=START_OF_IMAGE => {}
+            _ => {
+                let length = read_u16(&mut file)?;
+                let mut rest = u64::from(length.checked_sub(2).ok_or(JpegError::Malformed("a segment has no length"))?);
+                // Start of frame, whatever the process; not the tables and extensions among them.
+                if matches!(marker, 0xc0..=0xcf) && !matches!(marker, 0xc4 | 0xc8 | 0xcc) {
+                    if rest < 5 {
+                        return Err(JpegError::Malformed("its frame header is too short"));
+                    }
+                    let mut precision = [0];
+                    file.read_exact(&mut precision)?;
+                    let height = u32::from(read_u16(&mut file)?);
+                    let width = u32::from(read_u16(&mut file)?);
+                    if width == 0 || height == 0 {
+                        return Err(JpegError::Malformed("it has no pixels"));
+                    }
+                    rest -= 5;
+                    if !limit([width, height]) {
+                        return Ok([width, height]);
+                    }
+                    size_px = Some([width, height]);
+                }
+                if io::copy(&mut io::Read::take(&mut file, rest), &mut io::sink())? < rest {
+                    return Err(JpegError::CutShort);
+                }
+            }
+        }
+        if marker == START_OF_SCAN {
+            scans += 1;
+        }
+        marker = next_marker(&mut file, marker == START_OF_SCAN)?;
+    }
+    match size_px {
+        Some(size_px) if scans > 0 => Ok(size_px),
+        _ => Err(JpegError::Malformed("it holds no picture")),
+    }
+}
+
+/// The next marker; within a scan, entropy-coded bytes and restart markers are passed over.
+fn next_marker(file: &mut impl BufRead, in_scan: bool) -> Result<u8, JpegError> {
+    loop {
+        let mut byte = [0];
+        if in_scan {
+            skip_to_ff(file)?;
+        }
+        file.read_exact(&mut byte)?;
+        if byte[0] != 0xff {
+            return Err(JpegError::Malformed("a marker is missing between its segments"));
+        }
+        while byte[0] == 0xff {
+            file.read_exact(&mut byte)?;
+        }
+        match byte[0] {
+            0x00 | 0xd0..=0xd7 if in_scan => {}
+            0x00 => return Err(JpegError::Malformed("a marker is missing between its segments")),
+            marker => return Ok(marker),
+        }
+    }
+}
+
+fn skip_to_ff(file: &mut impl BufRead) -> Result<(), JpegError> {
+    loop {
+        let buffer = file.fill_buf()?;
+        if buffer.is_empty() {
+            return Err(JpegError::CutShort);
+        }
+        match buffer.iter().position(|byte| *byte == 0xff) {
+            Some(at) => {
+                file.consume(at);
+                return Ok(());
+            }
+            None => {
+                let all = buffer.len();
+                file.consume(all);
+            }
+        }
+    }
+}
+
+fn read_u16(file: &mut impl BufRead) -> Result<u16, JpegError> {
+    let mut bytes = [0; 2];
+    file.read_exact(&mut bytes)?;
+    Ok(u16::from_be_bytes(bytes))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use image::codecs::jpeg::JpegEncoder;
+
+    fn jpeg() -> Vec<u8> {
+        let image = image::RgbImage::from_fn(64, 48, |x, y| image::Rgb([(x * 7) as u8, (y * 5) as u8, (x * y) as u8]));
+        let mut bytes = Vec::new();
+        JpegEncoder::new_with_quality(&mut bytes, 95).encode_image(&image).unwrap();
+        bytes
+    }
+
+    #[test]
+    fn a_whole_image_has_its_size_even_with_bytes_behind_it() {
+        let mut bytes = jpeg();
+        assert_eq!(walk(&bytes[..], |_| true).unwrap(), [64, 48]);
+        bytes.extend_from_slice(b"preview");
+        assert_eq!(walk(&bytes[..], |_| true).unwrap(), [64, 48]);
+    }
+
+    #[test]
+    fn every_way_to_cut_it_is_seen() {
+        let bytes = jpeg();
+        for end in 0..bytes.len() {
+            assert!(walk(&bytes[..end], |_| true).is_err(), "cut at {end} of {}", bytes.len());
+        }
+    }
+
+    #[test]
+    fn the_limit_is_asked_before_the_scan() {
+        let bytes = jpeg();
+        assert_eq!(walk(&bytes[..bytes.len() / 2], |_| false).unwrap(), [64, 48]);
+    }
+}

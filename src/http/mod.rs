@@ -1,0 +1,21 @@
+//! The HTTP API and the web page. `router.rs` is the table of contents; the interface is described by `/openapi.yaml`.
+
+pub mod error;
+pub mod router;
+pub mod state;
+
+mod docs;
+mod extract;
+mod features;
+mod health;
+mod intake;
+mod jobs;
+mod models;
+mod page;
+mod paging;
+mod plants;
+mod surveys;
+mod uploads;
+
+pub use router::{openapi, router};
+pub use state::AppState;

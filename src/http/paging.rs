@@ -1,0 +1,87 @@
+//! Lists in parts: a limit and a cursor, and a link to the next part.
+
+use super::error::{ApiError, Code};
+use crate::store::Page;
+use axum::Json;
+use axum::http::{HeaderValue, header};
+use axum::response::{IntoResponse, Response};
+use serde::{Deserialize, Serialize};
+
+const DEFAULT_LIMIT: u32 = 100;
+const MAX_LIMIT: u32 = 1000;
+
+/// Which part of a list.
+#[derive(Debug, Deserialize, utoipa::IntoParams)]
+#[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
+pub struct PageQuery {
+    /// Most items in the answer.
+    #[param(minimum = 1, maximum = 1000, default = 100)]
+    pub limit: Option<u32>,
+    /// Where to go on: taken from the link to the next part.
+    pub cursor: Option<String>,
+}
+
+impl PageQuery {
+    /// The rows to ask for: one more than is shown tells whether there is a next part.
+    pub fn page(&self) -> Result<Page, ApiError> {
+        Ok(Page { after: self.cursor.as_deref().map(parse_cursor).transpose()?, limit: self.limit()? + 1 })
+    }
+
+    fn limit(&self) -> Result<u32, ApiError> {
+        let limit = self.limit.unwrap_or(DEFAULT_LIMIT);
+        match limit {
+            1..=MAX_LIMIT => Ok(limit),
+            _ => Err(ApiError::new(Code::InvalidQuery, format!("limit is {limit}; it must be 1 to {MAX_LIMIT}"))),
+        }
+    }
+
+    /// The part of a list from the rows asked for; `seq` is a row's sequence number.
+    pub fn items<R, T>(
+        &self,
+        path: &str,
+        rows: Vec<R>,
+        seq: impl Fn(&R) -> i64,
+        view: impl Fn(R) -> T,
+    ) -> Result<List<T>, ApiError> {
+        let limit = self.limit()?;
+        let more = rows.len() > limit as usize;
+        let mut last = None;
+        let items = rows.into_iter().take(limit as usize).inspect(|row| last = Some(seq(row))).map(view).collect();
+        let next = last.filter(|_| more).map(|last| format!("{path}?limit={limit}&cursor={last}"));
+        Ok(List { items, next })
+    }
+}
+
+/// Reads a cursor that this service gave.
+pub fn parse_cursor(cursor: &str) -> Result<i64, ApiError> {
+    cursor.parse().ok().filter(|seq| *seq >= 0).ok_or_else(|| {
+        ApiError::new(
+            Code::InvalidQuery,
+            "the cursor is none of this service's: take it from the link to the next part",
+        )
+    })
+}
+
+/// A `Link` header to the next part.
+pub fn next_link(url: &str) -> Option<(header::HeaderName, HeaderValue)> {
+    Some((header::LINK, HeaderValue::from_str(&format!("<{url}>; rel=\"next\"")).ok()?))
+}
+
+/// A part of a list.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub struct List<T> {
+    pub items: Vec<T>,
+    /// The next part, where there is one; also in the header `link`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub next: Option<String>,
+}
+
+impl<T: Serialize> IntoResponse for List<T> {
+    fn into_response(self) -> Response {
+        let link = self.next.as_deref().and_then(next_link);
+        let mut response = Json(self).into_response();
+        response.headers_mut().extend(link);
+        response
+    }
+}

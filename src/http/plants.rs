@@ -1,0 +1,129 @@
+//! Plants.
+
+use super::AppState;
+use super::error::{ApiError, Code, Problem};
+use super::extract::{ApiJson, ApiPath, ApiQuery};
+use super::paging::{List, PageQuery};
+use crate::plant::PlantId;
+use crate::store::{Created, Plant};
+use axum::Json;
+use axum::extract::State;
+use axum::http::{StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
+
+/// A plant to be created.
+#[derive(Debug, Deserialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct NewPlant {
+    /// What people call it; no two plants have the same name.
+    #[schema(min_length = 1, max_length = 200, example = "Sunfield North")]
+    pub name: String,
+}
+
+/// A photovoltaic plant.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub struct PlantView {
+    #[schema(value_type = Uuid)]
+    pub id: PlantId,
+    pub name: String,
+    #[schema(value_type = String, format = DateTime)]
+    pub created: Timestamp,
+}
+
+impl From<Plant> for PlantView {
+    fn from(plant: Plant) -> Self {
+        Self { id: plant.id, name: plant.name, created: plant.created }
+    }
+}
+
+/// Reads a name that people give: one line, not empty, not endless.
+pub fn checked_name(name: &str) -> Result<&str, ApiError> {
+    let name = name.trim();
+    let length = name.chars().count();
+    if (1..=200).contains(&length) && !name.chars().any(char::is_control) {
+        return Ok(name);
+    }
+    Err(ApiError::new(Code::InvalidName, "a name has 1 to 200 characters and no line breaks"))
+}
+
+/// The answer to a creation: 201 with its place, or 200 where it was there already.
+pub fn created_answer<T: Serialize>(location: String, new: bool, view: T) -> Response {
+    let status = if new { StatusCode::CREATED } else { StatusCode::OK };
+    (status, [(header::LOCATION, location)], Json(view)).into_response()
+}
+
+/// Create a plant, or find the one of that name
+#[utoipa::path(
+    post,
+    path = "/api/v1/plants",
+    tag = "plants",
+    request_body = NewPlant,
+    responses(
+        (status = 201, description = "Created", body = PlantView, headers(("location" = String))),
+        (status = 200, description = "A plant of that name was there", body = PlantView, headers(("location" = String))),
+        (status = "4XX", description = "`invalid_json`, `invalid_fields`, `invalid_name`, `unsupported_media_type`, `too_large`",
+            body = Problem, content_type = "application/problem+json")
+    )
+)]
+pub async fn create(State(state): State<AppState>, ApiJson(new): ApiJson<NewPlant>) -> Result<Response, ApiError> {
+    let (plant, new) = match state.store.create_plant(checked_name(&new.name)?, Timestamp::now()).await? {
+        Created::New(plant) => (plant, true),
+        Created::Existing(plant) => (plant, false),
+    };
+    Ok(created_answer(format!("/api/v1/plants/{}", plant.id), new, PlantView::from(plant)))
+}
+
+/// List plants
+#[utoipa::path(
+    get,
+    path = "/api/v1/plants",
+    tag = "plants",
+    params(PageQuery),
+    responses(
+        (status = 200, body = List<PlantView>),
+        (status = 400, description = "`invalid_query`", body = Problem, content_type = "application/problem+json")
+    )
+)]
+pub async fn list(
+    State(state): State<AppState>,
+    ApiQuery(query): ApiQuery<PageQuery>,
+) -> Result<List<PlantView>, ApiError> {
+    let plants = state.store.plants(query.page()?).await?;
+    query.items("/api/v1/plants", plants, |plant| plant.seq, PlantView::from)
+}
+
+/// One plant
+#[utoipa::path(
+    get,
+    path = "/api/v1/plants/{plant}",
+    tag = "plants",
+    params(("plant" = Uuid, Path, description = "The plant's identifier")),
+    responses(
+        (status = 200, body = PlantView),
+        (status = 404, description = "`plant_not_found`", body = Problem, content_type = "application/problem+json")
+    )
+)]
+pub async fn get(State(state): State<AppState>, ApiPath(plant): ApiPath<PlantId>) -> Result<Json<PlantView>, ApiError> {
+    Ok(Json(state.require_plant(plant).await?.into()))
+}
+
+/// Delete a plant with its surveys, files, jobs and models
+///
+/// A job that runs is stopped. Deleting a plant that is not there is 204 too: the request may be repeated.
+#[utoipa::path(
+    delete,
+    path = "/api/v1/plants/{plant}",
+    tag = "plants",
+    params(("plant" = Uuid, Path, description = "The plant's identifier")),
+    responses(
+        (status = 204, description = "Nothing of it is left"),
+        (status = 404, description = "`not_found`: no identifier", body = Problem, content_type = "application/problem+json")
+    )
+)]
+pub async fn delete(State(state): State<AppState>, ApiPath(plant): ApiPath<PlantId>) -> Result<StatusCode, ApiError> {
+    state.store.delete_plant(plant).await?;
+    state.blobs.delete_plant(plant).await?;
+    Ok(StatusCode::NO_CONTENT)
+}

@@ -1,0 +1,125 @@
+//! The table of contents.
+
+use super::{AppState, docs, error, features, health, jobs, models, page, plants, surveys, uploads};
+use axum::Router;
+use axum::body::Body;
+use axum::extract::{DefaultBodyLimit, Request};
+use axum::http::{HeaderName, HeaderValue, StatusCode};
+use axum::middleware::{self, Next};
+use axum::response::{IntoResponse, Response};
+use std::time::Duration;
+use tower_http::catch_panic::CatchPanicLayer;
+use tower_http::compression::CompressionLayer;
+use tower_http::request_id::{MakeRequestUuid, PropagateRequestIdLayer, RequestId, SetRequestIdLayer};
+use tower_http::timeout::TimeoutLayer;
+use tower_http::trace::TraceLayer;
+use tracing::Span;
+use utoipa::OpenApi;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+/// Largest JSON body.
+const MAX_JSON_BYTES: usize = 1 << 20;
+
+const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
+
+#[derive(OpenApi)]
+#[openapi(
+    info(
+        title = "heliomap",
+        description = "Turns drone overview photos of a photovoltaic plant into a georeferenced model of every module.\n\n\
+            Every error is a problem document (RFC 9457, `application/problem+json`) with a stable `code`. \
+            Plants and surveys are found again by their names: creating one of the same name answers 200 with the one \
+            that is there, so that every request may be repeated."
+    ),
+    components(schemas(error::Problem)),
+    tags(
+        (name = "plants", description = "Photovoltaic plants."),
+        (name = "surveys", description = "Flights over a plant: photos and their reconstruction."),
+        (name = "jobs", description = "Mappings of a survey."),
+        (name = "models", description = "What was found: modules, sectors, benches and lines as GeoJSON."),
+        (name = "operation", description = "Whether the service runs, and what it offers.")
+    )
+)]
+struct Description;
+
+/// Requests that are answered at once.
+fn prompt() -> OpenApiRouter<AppState> {
+    OpenApiRouter::new()
+        .routes(routes!(plants::create, plants::list))
+        .routes(routes!(plants::get, plants::delete))
+        .routes(routes!(surveys::create, surveys::list))
+        .routes(routes!(surveys::get))
+        .routes(routes!(jobs::start, jobs::list_of_survey))
+        .routes(routes!(jobs::list))
+        .routes(routes!(jobs::get))
+        .routes(routes!(jobs::cancel))
+        .routes(routes!(models::list))
+        .routes(routes!(models::get))
+        .routes(routes!(features::layer))
+        .routes(routes!(features::module))
+        .routes(routes!(health::health))
+        .routes(routes!(health::ready))
+        .routes(routes!(docs::openapi_yaml))
+        .routes(routes!(docs::openapi_json))
+}
+
+/// Requests that take as long as their bytes come.
+fn uploads() -> OpenApiRouter<AppState> {
+    OpenApiRouter::new()
+        .routes(routes!(uploads::put_image))
+        .routes(routes!(uploads::post_images))
+        .routes(routes!(uploads::put_reconstruction, uploads::post_reconstruction))
+        .routes(routes!(uploads::put_reconstruction_file))
+}
+
+/// The description of the whole API.
+pub fn openapi() -> utoipa::openapi::OpenApi {
+    OpenApiRouter::with_openapi(Description::openapi()).merge(prompt()).merge(uploads()).into_openapi()
+}
+
+/// The whole service.
+pub fn router(state: AppState) -> Router {
+    let timeout = TimeoutLayer::with_status_code(StatusCode::REQUEST_TIMEOUT, state.limits.request_timeout);
+    let prompt = prompt().layer(DefaultBodyLimit::max(MAX_JSON_BYTES)).layer(timeout);
+    let uploads = uploads().layer(DefaultBodyLimit::disable());
+    let (router, _) = OpenApiRouter::new().merge(prompt).merge(uploads).split_for_parts();
+    router
+        .fallback(page::serve)
+        .method_not_allowed_fallback(|| async { StatusCode::METHOD_NOT_ALLOWED })
+        .with_state(state)
+        // The innermost first.
+        .layer(CatchPanicLayer::custom(panicked))
+        .layer(middleware::map_response(error::only_problems))
+        .layer(CompressionLayer::new())
+        .layer(PropagateRequestIdLayer::new(REQUEST_ID))
+        .layer(TraceLayer::new_for_http().make_span_with(span).on_response(log_response).on_failure(()))
+        .layer(SetRequestIdLayer::new(REQUEST_ID, MakeRequestUuid))
+        .layer(middleware::from_fn(sane_request_id))
+}
+
+/// A client may name its requests, but only with what is safe in a log.
+async fn sane_request_id(mut request: Request, next: Next) -> Response {
+    let sane = |id: &HeaderValue| {
+        id.len() <= 64 && id.as_bytes().iter().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'-' | b'_' | b'.'))
+    };
+    if request.headers().get(REQUEST_ID).is_some_and(|id| !sane(id)) {
+        request.headers_mut().remove(REQUEST_ID);
+    }
+    next.run(request).await
+}
+
+fn span(request: &axum::http::Request<Body>) -> Span {
+    let id = request.extensions().get::<RequestId>().and_then(|id| id.header_value().to_str().ok()).unwrap_or("");
+    tracing::info_span!("request", method = %request.method(), path = request.uri().path(), id)
+}
+
+fn log_response<B>(response: &axum::http::Response<B>, latency: Duration, _: &Span) {
+    tracing::info!(status = response.status().as_u16(), milliseconds = latency.as_secs_f64() * 1e3, "answered");
+}
+
+fn panicked(panic: Box<dyn std::any::Any + Send>) -> Response {
+    let text = panic.downcast_ref::<&str>().copied().or_else(|| panic.downcast_ref::<String>().map(String::as_str));
+    tracing::error!(panic = text.unwrap_or("unknown"), "a handler panicked");
+    error::ApiError::new(error::Code::Internal, "this is a fault of the service; its log tells more").into_response()
+}

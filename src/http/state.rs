@@ -1,0 +1,44 @@
+//! What every handler may use.
+
+use super::error::{ApiError, Code};
+use crate::config::Limits;
+use crate::plant::PlantId;
+use crate::store::{Blobs, Plant, Store, Survey, SurveyId};
+use std::sync::Arc;
+use tokio::sync::Notify;
+
+/// What every handler may use.
+#[derive(Clone)]
+pub struct AppState {
+    pub store: Arc<dyn Store>,
+    pub blobs: Blobs,
+    pub limits: Arc<Limits>,
+    /// Rung when a job was queued.
+    pub bell: Arc<Notify>,
+}
+
+impl AppState {
+    /// The plant, or a problem.
+    pub async fn require_plant(&self, plant: PlantId) -> Result<Plant, ApiError> {
+        self.store.plant(plant).await?.ok_or_else(|| {
+            ApiError::new(
+                Code::PlantNotFound,
+                format!("no plant has the identifier {plant}; GET /api/v1/plants lists them"),
+            )
+        })
+    }
+
+    /// The survey of the plant, or a problem.
+    pub async fn require_survey(&self, plant: PlantId, survey: SurveyId) -> Result<Survey, ApiError> {
+        if let Some(survey) = self.store.survey(plant, survey).await? {
+            return Ok(survey);
+        }
+        self.require_plant(plant).await?;
+        Err(ApiError::new(
+            Code::SurveyNotFound,
+            format!(
+                "no survey of this plant has the identifier {survey}; GET /api/v1/plants/{plant}/surveys lists them"
+            ),
+        ))
+    }
+}

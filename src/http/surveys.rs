@@ -1,0 +1,187 @@
+//! Surveys.
+
+use super::AppState;
+use super::error::{ApiError, Problem};
+use super::extract::{ApiJson, ApiPath, ApiQuery};
+use super::paging::{List, PageQuery};
+use super::plants::{checked_name, created_answer};
+use crate::jobs;
+use crate::plant::PlantId;
+use crate::store::{Created, FileRecord, Survey, SurveyId};
+use axum::Json;
+use axum::extract::State;
+use axum::response::Response;
+use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
+
+/// A survey to be created.
+#[derive(Debug, Deserialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct NewSurvey {
+    /// What people call it; no two surveys of a plant have the same name.
+    #[schema(min_length = 1, max_length = 200, example = "2026-06-21 morning")]
+    pub name: String,
+}
+
+/// One flight over a plant.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub struct SurveyView {
+    #[schema(value_type = Uuid)]
+    pub id: SurveyId,
+    #[schema(value_type = Uuid)]
+    pub plant: PlantId,
+    pub name: String,
+    #[schema(value_type = String, format = DateTime)]
+    pub created: Timestamp,
+}
+
+impl From<Survey> for SurveyView {
+    fn from(survey: Survey) -> Self {
+        Self { id: survey.id, plant: survey.plant, name: survey.name, created: survey.created }
+    }
+}
+
+/// A survey with what was uploaded to it.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub struct SurveyDetail {
+    #[serde(flatten)]
+    pub survey: SurveyView,
+    /// Whether it can be mapped: nothing is missing.
+    pub complete: bool,
+    /// What is missing before it can be mapped.
+    pub missing: Vec<MissingView>,
+    /// Sorted by path.
+    pub files: Vec<FileView>,
+}
+
+/// Something that a survey lacks.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub struct MissingView {
+    /// `too_few_images`, `no_reconstruction` or `no_reference`.
+    pub code: &'static str,
+    /// What is missing and what to do.
+    pub message: String,
+}
+
+/// What a survey with these files lacks.
+pub fn missing_views(files: &[FileRecord]) -> Vec<MissingView> {
+    let view = |missing: jobs::Missing| MissingView { code: missing.code, message: missing.message };
+    jobs::missing(files).into_iter().map(view).collect()
+}
+
+/// A file of a survey.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub struct FileView {
+    /// Its place in the survey's folder.
+    #[schema(example = "images/DJI_0001.jpg")]
+    pub path: String,
+    /// `image` or `reconstruction`.
+    pub kind: &'static str,
+    /// Bytes.
+    pub size: u64,
+    /// SHA-256 of its bytes, hexadecimal.
+    #[schema(min_length = 64, max_length = 64)]
+    pub sha256: String,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub width_px: Option<u32>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub height_px: Option<u32>,
+    #[schema(value_type = String, format = DateTime)]
+    pub stored: Timestamp,
+}
+
+impl From<FileRecord> for FileView {
+    fn from(file: FileRecord) -> Self {
+        Self {
+            path: file.path.to_string(),
+            kind: file.path.kind().as_str(),
+            size: file.size,
+            sha256: file.sha256.to_string(),
+            width_px: file.size_px.map(|size| size[0]),
+            height_px: file.size_px.map(|size| size[1]),
+            stored: file.stored,
+        }
+    }
+}
+
+/// Create a survey of a plant, or find the one of that name
+#[utoipa::path(
+    post,
+    path = "/api/v1/plants/{plant}/surveys",
+    tag = "surveys",
+    params(("plant" = Uuid, Path, description = "The plant's identifier")),
+    request_body = NewSurvey,
+    responses(
+        (status = 201, description = "Created", body = SurveyView, headers(("location" = String))),
+        (status = 200, description = "A survey of that name was there", body = SurveyView, headers(("location" = String))),
+        (status = "4XX", description = "`plant_not_found`, `invalid_json`, `invalid_fields`, `invalid_name`, \
+            `unsupported_media_type`, `too_large`", body = Problem, content_type = "application/problem+json")
+    )
+)]
+pub async fn create(
+    State(state): State<AppState>,
+    ApiPath(plant): ApiPath<PlantId>,
+    ApiJson(new): ApiJson<NewSurvey>,
+) -> Result<Response, ApiError> {
+    let name = checked_name(&new.name)?;
+    state.require_plant(plant).await?;
+    let (survey, new) = match state.store.create_survey(plant, name, Timestamp::now()).await? {
+        Created::New(survey) => (survey, true),
+        Created::Existing(survey) => (survey, false),
+    };
+    let location = format!("/api/v1/plants/{plant}/surveys/{}", survey.id);
+    Ok(created_answer(location, new, SurveyView::from(survey)))
+}
+
+/// List a plant's surveys
+#[utoipa::path(
+    get,
+    path = "/api/v1/plants/{plant}/surveys",
+    tag = "surveys",
+    params(("plant" = Uuid, Path, description = "The plant's identifier"), PageQuery),
+    responses(
+        (status = 200, body = List<SurveyView>),
+        (status = "4XX", description = "`plant_not_found`, `invalid_query`", body = Problem,
+            content_type = "application/problem+json")
+    )
+)]
+pub async fn list(
+    State(state): State<AppState>,
+    ApiPath(plant): ApiPath<PlantId>,
+    ApiQuery(query): ApiQuery<PageQuery>,
+) -> Result<List<SurveyView>, ApiError> {
+    let page = query.page()?;
+    state.require_plant(plant).await?;
+    let surveys = state.store.surveys(plant, page).await?;
+    query.items(&format!("/api/v1/plants/{plant}/surveys"), surveys, |survey| survey.seq, SurveyView::from)
+}
+
+/// One survey: its files, and what is missing
+#[utoipa::path(
+    get,
+    path = "/api/v1/plants/{plant}/surveys/{survey}",
+    tag = "surveys",
+    params(
+        ("plant" = Uuid, Path, description = "The plant's identifier"),
+        ("survey" = Uuid, Path, description = "The survey's identifier")
+    ),
+    responses(
+        (status = 200, body = SurveyDetail),
+        (status = 404, description = "`plant_not_found`, `survey_not_found`", body = Problem,
+            content_type = "application/problem+json")
+    )
+)]
+pub async fn get(
+    State(state): State<AppState>,
+    ApiPath((plant, survey)): ApiPath<(PlantId, SurveyId)>,
+) -> Result<Json<SurveyDetail>, ApiError> {
+    let survey = state.require_survey(plant, survey).await?;
+    let files = state.store.files(survey.id).await?;
+    let missing = missing_views(&files);
+    Ok(Json(SurveyDetail {
+        complete: missing.is_empty(),
+        missing,
+        survey: survey.into(),
+        files: files.into_iter().map(FileView::from).collect(),
+    }))
+}

@@ -1,0 +1,373 @@
+//! Uploads to a survey: photos one by one or many at once, the reconstruction file by file or as one archive.
+//!
+//! Bytes are streamed to disk, checked, stored under their digest, and only then entered in the survey: an upload that
+//! fails leaves the survey as it was. Every upload may be repeated; the same bytes change nothing.
+
+use super::AppState;
+use super::error::{ApiError, Code, Problem};
+use super::extract::ApiPath;
+use super::intake;
+use super::intake::archive::{self, ArchiveError, Unpacked};
+use super::intake::receive::{Bounds, drain, receive};
+use super::surveys::FileView;
+use crate::plant::PlantId;
+use crate::store::{Content, FileRecord, FileWritten, ImageName, StagedFile, StoreError, SurveyId, SurveyPath};
+use axum::Json;
+use axum::body::{Body, BodyDataStream};
+use axum::extract::multipart::MultipartRejection;
+use axum::extract::{Multipart, State};
+use axum::http::{HeaderMap, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use serde::Serialize;
+
+/// A file that was uploaded.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub struct UploadedFile {
+    /// `created`, `replaced`, or `unchanged` where the same bytes were there.
+    pub result: &'static str,
+    #[serde(flatten)]
+    pub file: FileView,
+}
+
+/// Files that were uploaded together.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub struct UploadedFiles {
+    pub files: Vec<UploadedFile>,
+}
+
+/// The files of an archive that was uploaded.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub struct UploadedArchive {
+    pub files: Vec<UploadedFile>,
+    /// How many of its entries are no files of a survey; they were left out.
+    pub ignored_count: usize,
+    /// The first few of them.
+    pub ignored: Vec<String>,
+}
+
+fn uploaded((record, written): (FileRecord, FileWritten)) -> UploadedFile {
+    let result = match written {
+        FileWritten::Created => "created",
+        FileWritten::Replaced => "replaced",
+        FileWritten::Unchanged => "unchanged",
+    };
+    UploadedFile { result, file: record.into() }
+}
+
+/// Upload one photo
+///
+/// The body is the image file. Uploading the same bytes again changes nothing.
+#[utoipa::path(
+    put,
+    path = "/api/v1/plants/{plant}/surveys/{survey}/images/{name}",
+    tag = "surveys",
+    params(
+        ("plant" = Uuid, Path, description = "The plant's identifier"),
+        ("survey" = Uuid, Path, description = "The survey's identifier"),
+        ("name" = String, Path, description = "The photo's file name, as the reconstruction names it")
+    ),
+    request_body(content = Vec<u8>, content_type = "application/octet-stream", description = "A JPEG, PNG or TIFF file"),
+    responses(
+        (status = 201, description = "Created", body = UploadedFile),
+        (status = 200, description = "Replaced, or unchanged", body = UploadedFile),
+        (status = "4XX", description = "`plant_not_found`, `survey_not_found`, `invalid_name`, `too_large`, `image_too_large`, \
+            `image_format_mismatch`, `image_unreadable`, `image_truncated`, `upload_interrupted`, `upload_stalled`",
+            body = Problem, content_type = "application/problem+json"),
+        (status = 507, description = "`storage_full`", body = Problem, content_type = "application/problem+json")
+    )
+)]
+pub async fn put_image(
+    State(state): State<AppState>,
+    ApiPath((plant, survey, name)): ApiPath<(PlantId, SurveyId, String)>,
+    headers: HeaderMap,
+    body: Body,
+) -> Result<Response, ApiError> {
+    let place = ImageName::parse(&name).map(|name| SurveyPath::of_image(&name));
+    put_one(&state, plant, survey, place.map_err(ApiError::from), &headers, body).await
+}
+
+/// Upload one file of the reconstruction
+///
+/// `path` is its place in OpenSfM's folder: `reconstruction.json`, `reference_lla.json`, `camera_models.json`,
+/// `undistorted/reconstruction.json`, `undistorted/undistorted_shot_ids.json`, `undistorted/images/NAME`,
+/// `undistorted/depthmaps/merged.ply`.
+#[utoipa::path(
+    put,
+    path = "/api/v1/plants/{plant}/surveys/{survey}/reconstruction/{*path}",
+    tag = "surveys",
+    params(
+        ("plant" = Uuid, Path, description = "The plant's identifier"),
+        ("survey" = Uuid, Path, description = "The survey's identifier"),
+        ("path" = String, Path, description = "The file's place in OpenSfM's folder")
+    ),
+    request_body(content = Vec<u8>, content_type = "application/octet-stream", description = "The file"),
+    responses(
+        (status = 201, description = "Created", body = UploadedFile),
+        (status = 200, description = "Replaced, or unchanged", body = UploadedFile),
+        (status = "4XX", description = "`plant_not_found`, `survey_not_found`, `unknown_file`, `invalid_name`, `too_large`, \
+            `file_unreadable`, `image_too_large`, `image_format_mismatch`, `image_unreadable`, `image_truncated`, \
+            `upload_interrupted`, `upload_stalled`", body = Problem, content_type = "application/problem+json"),
+        (status = 507, description = "`storage_full`", body = Problem, content_type = "application/problem+json")
+    )
+)]
+pub async fn put_reconstruction_file(
+    State(state): State<AppState>,
+    ApiPath((plant, survey, path)): ApiPath<(PlantId, SurveyId, String)>,
+    headers: HeaderMap,
+    body: Body,
+) -> Result<Response, ApiError> {
+    let place = SurveyPath::of_reconstruction(&path).map_err(ApiError::from);
+    put_one(&state, plant, survey, place, &headers, body).await
+}
+
+async fn put_one(
+    state: &AppState,
+    plant: PlantId,
+    survey: SurveyId,
+    place: Result<SurveyPath, ApiError>,
+    headers: &HeaderMap,
+    body: Body,
+) -> Result<Response, ApiError> {
+    let mut body = body.into_data_stream();
+    let stored = async {
+        let place = place?;
+        state.require_survey(plant, survey).await?;
+        let limit = match place.content() {
+            Content::Image => state.limits.max_image_size,
+            Content::Json { .. } | Content::Ply => state.limits.max_file_size,
+        };
+        let staged = receive_body(state, place.as_str(), limit, headers, &mut body).await?;
+        let checked = intake::check(state, place, staged).await?;
+        intake::store(state, plant, survey, vec![checked]).await
+    };
+    match stored.await {
+        Ok(stored) => {
+            let new = stored.iter().any(|(_, written)| *written == FileWritten::Created);
+            let status = if new { StatusCode::CREATED } else { StatusCode::OK };
+            let file = stored.into_iter().next().map(uploaded);
+            Ok((status, Json(file)).into_response())
+        }
+        Err(problem) => {
+            drain(&mut body).await;
+            Err(problem)
+        }
+    }
+}
+
+/// Streams a whole body to disk; one that says that it is too large is refused before.
+async fn receive_body(
+    state: &AppState,
+    name: &str,
+    max_bytes: u64,
+    headers: &HeaderMap,
+    body: &mut BodyDataStream,
+) -> Result<StagedFile, ApiError> {
+    let announced = headers.get(header::CONTENT_LENGTH).and_then(|value| value.to_str().ok()?.parse::<u64>().ok());
+    if announced.is_some_and(|length| length > max_bytes) {
+        return Err(intake::too_large(name, max_bytes));
+    }
+    let bounds = Bounds { name, max_bytes, idle: state.limits.request_timeout };
+    receive(body, state.blobs.staging(), bounds).await
+}
+
+/// Upload many photos at once
+///
+/// A `multipart/form-data` body in which every part with a file name is a photo. Each photo is checked and stored on
+/// its own: where some are refused, the answer is a problem document with the members `files` (what was stored) and
+/// `refused` (a problem document for each that was not, with its name), and only those need be sent again.
+#[utoipa::path(
+    post,
+    path = "/api/v1/plants/{plant}/surveys/{survey}/images",
+    tag = "surveys",
+    params(
+        ("plant" = Uuid, Path, description = "The plant's identifier"),
+        ("survey" = Uuid, Path, description = "The survey's identifier")
+    ),
+    request_body(content = inline(PhotoForm), content_type = "multipart/form-data"),
+    responses(
+        (status = 200, description = "All stored", body = UploadedFiles),
+        (status = "4XX", description = "`plant_not_found`, `survey_not_found`, `files_refused`, `bad_request`, \
+            `upload_interrupted`, `upload_stalled`, `unsupported_media_type`, `too_large`", body = Problem,
+            content_type = "application/problem+json"),
+        (status = 507, description = "`storage_full`", body = Problem, content_type = "application/problem+json")
+    )
+)]
+pub async fn post_images(
+    State(state): State<AppState>,
+    ApiPath((plant, survey)): ApiPath<(PlantId, SurveyId)>,
+    form: Result<Multipart, MultipartRejection>,
+) -> Result<Json<UploadedFiles>, ApiError> {
+    let mut form = form.map_err(|_| {
+        ApiError::new(
+            Code::UnsupportedMediaType,
+            "send multipart/form-data with a boundary, as `curl -F file=@DJI_0001.jpg -F file=@DJI_0002.jpg` does",
+        )
+    })?;
+    state.require_survey(plant, survey).await?;
+    let mut files = Vec::new();
+    let mut refused = Vec::new();
+    let mut parts = 0;
+    loop {
+        let next = tokio::time::timeout(state.limits.request_timeout, form.next_field()).await;
+        let stalled = |_| ApiError::new(Code::UploadStalled, "the form stood still; send what is not stored yet again");
+        let malformed = |error: axum::extract::multipart::MultipartError| {
+            ApiError::new(Code::BadRequest, format!("the form cannot be read: {}", error.body_text()))
+                .with("files", &files)
+                .with("refused", &refused)
+        };
+        let Some(mut part) = next.map_err(stalled)?.map_err(malformed)? else { break };
+        let Some(name) = part.file_name().map(str::to_owned) else { continue };
+        parts += 1;
+        if parts > state.limits.max_entries {
+            return Err(ApiError::new(
+                Code::TooLarge,
+                format!("the form has more than {} files; send the rest in another", state.limits.max_entries),
+            )
+            .with("files", &files)
+            .with("refused", &refused));
+        }
+        let stored = async {
+            let place = SurveyPath::of_image(&ImageName::parse(&name)?);
+            let bounds = Bounds {
+                name: place.as_str(),
+                max_bytes: state.limits.max_image_size,
+                idle: state.limits.request_timeout,
+            };
+            let staged = receive(&mut part, state.blobs.staging(), bounds).await?;
+            let checked = intake::check(&state, place, staged).await?;
+            intake::store(&state, plant, survey, vec![checked]).await
+        };
+        match stored.await {
+            Ok(stored) => files.extend(stored.into_iter().map(uploaded)),
+            // The connection or the service failed, not this file: the next would fare no better.
+            Err(problem) if problem.code.parts().0.is_server_error() || problem.code == Code::UploadInterrupted => {
+                return Err(problem.with("files", &files).with("refused", &refused));
+            }
+            Err(problem) => refused.push(problem.with("name", name).document()),
+        }
+    }
+    if !refused.is_empty() {
+        let detail = format!(
+            "{} of {parts} files were refused, the others are stored; `refused` says why and what to do",
+            refused.len()
+        );
+        return Err(ApiError::new(Code::FilesRefused, detail).with("files", files).with("refused", refused));
+    }
+    if files.is_empty() {
+        return Err(ApiError::new(
+            Code::BadRequest,
+            "the form holds no file: give each photo a part with a file name, as `curl -F file=@DJI_0001.jpg` does",
+        ));
+    }
+    Ok(Json(UploadedFiles { files }))
+}
+
+/// A form of photos.
+#[derive(utoipa::ToSchema)]
+#[expect(dead_code, reason = "it describes a form that is read part by part")]
+struct PhotoForm {
+    /// The photos; the name of the part does not matter, the file name does.
+    #[schema(value_type = Vec<String>, format = Binary)]
+    file: Vec<Vec<u8>>,
+}
+
+/// Upload a reconstruction as one zip, tar or tar.gz
+///
+/// The archive holds OpenSfM's folder or what is in it, photos included if you like. All of its known files are stored
+/// or, where one is refused, none; other files in it are ignored.
+#[utoipa::path(
+    put,
+    path = "/api/v1/plants/{plant}/surveys/{survey}/reconstruction",
+    tag = "surveys",
+    params(
+        ("plant" = Uuid, Path, description = "The plant's identifier"),
+        ("survey" = Uuid, Path, description = "The survey's identifier")
+    ),
+    request_body(content = Vec<u8>, content_type = "application/octet-stream", description = "A zip, tar or gzipped tar"),
+    responses(
+        (status = 200, description = "All stored", body = UploadedArchive),
+        (status = "4XX", description = "`plant_not_found`, `survey_not_found`, `unsupported_archive`, `archive_unsafe`, \
+            `archive_unreadable`, `archive_empty`, `archive_too_large`, `too_large`, `invalid_name`, `file_unreadable`, \
+            `image_too_large`, `image_format_mismatch`, `image_unreadable`, `image_truncated`, `upload_interrupted`, \
+            `upload_stalled`", body = Problem, content_type = "application/problem+json"),
+        (status = 507, description = "`storage_full`", body = Problem, content_type = "application/problem+json")
+    )
+)]
+pub async fn put_reconstruction(
+    State(state): State<AppState>,
+    ApiPath((plant, survey)): ApiPath<(PlantId, SurveyId)>,
+    headers: HeaderMap,
+    body: Body,
+) -> Result<Json<UploadedArchive>, ApiError> {
+    let mut body = body.into_data_stream();
+    let stored = async {
+        state.require_survey(plant, survey).await?;
+        let archive = receive_body(&state, "the archive", state.limits.max_archive_size, &headers, &mut body).await?;
+        let Unpacked { files, ignored, ignored_count } = unpack(&state, archive).await?;
+        let mut checked = Vec::with_capacity(files.len());
+        for (place, staged) in files {
+            let limit = match place.content() {
+                Content::Image => state.limits.max_image_size,
+                Content::Json { .. } | Content::Ply => state.limits.max_file_size,
+            };
+            if staged.size > limit {
+                return Err(intake::too_large(place.as_str(), limit));
+            }
+            checked.push(intake::check(&state, place, staged).await?);
+        }
+        let files = intake::store(&state, plant, survey, checked).await?.into_iter().map(uploaded).collect();
+        Ok(Json(UploadedArchive { files, ignored_count, ignored }))
+    };
+    let stored: Result<_, ApiError> = stored.await;
+    if stored.is_err() {
+        drain(&mut body).await;
+    }
+    stored
+}
+
+/// As `PUT`
+#[utoipa::path(
+    post,
+    path = "/api/v1/plants/{plant}/surveys/{survey}/reconstruction",
+    tag = "surveys",
+    params(
+        ("plant" = Uuid, Path, description = "The plant's identifier"),
+        ("survey" = Uuid, Path, description = "The survey's identifier")
+    ),
+    request_body(content = Vec<u8>, content_type = "application/octet-stream", description = "A zip, tar or gzipped tar"),
+    responses(
+        (status = 200, description = "All stored", body = UploadedArchive),
+        (status = "4XX", description = "As `PUT`", body = Problem, content_type = "application/problem+json"),
+        (status = 507, description = "`storage_full`", body = Problem, content_type = "application/problem+json")
+    )
+)]
+pub async fn post_reconstruction(
+    state: State<AppState>,
+    path: ApiPath<(PlantId, SurveyId)>,
+    headers: HeaderMap,
+    body: Body,
+) -> Result<Json<UploadedArchive>, ApiError> {
+    put_reconstruction(state, path, headers, body).await
+}
+
+async fn unpack(state: &AppState, archive: StagedFile) -> Result<Unpacked, ApiError> {
+    let (folder, limits) = (state.blobs.staging().to_owned(), state.limits.clone());
+    let work = tokio::task::spawn_blocking(move || archive::unpack(&archive.path, &folder, &limits));
+    let unpacked = work.await.map_err(|error| ApiError::internal(&error))?;
+    unpacked.map_err(|error| {
+        let code = match &error {
+            ArchiveError::Unknown => Code::UnsupportedArchive,
+            ArchiveError::Unreadable(_) => Code::ArchiveUnreadable,
+            ArchiveError::Unsafe { .. } | ArchiveError::Twice { .. } => Code::ArchiveUnsafe,
+            ArchiveError::TooLarge { .. } => Code::ArchiveTooLarge,
+            ArchiveError::Name { .. } => Code::InvalidName,
+            ArchiveError::NothingKnown { .. } => Code::ArchiveEmpty,
+            ArchiveError::Disk(_) => {
+                let ArchiveError::Disk(source) = error else { return ApiError::internal(&error) };
+                let path = state.blobs.staging().to_owned();
+                return StoreError::Io { action: "unpack into", path, source }.into();
+            }
+        };
+        ApiError::new(code, error.to_string())
+    })
+}

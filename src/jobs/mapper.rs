@@ -1,0 +1,63 @@
+//! What a worker runs.
+
+use crate::detection::{DetectionError, Detector};
+use crate::pipeline::{self, Boxes, MapError, MapOptions, Observer, Subject};
+use crate::plant::PlantModel;
+use std::path::Path;
+use std::sync::{Arc, Mutex};
+
+/// Maps the plant in a folder. Called on a thread of its own.
+pub trait Mapper: Send + Sync + 'static {
+    /// As [`pipeline::map_folder`], of which only the model counts.
+    fn map(
+        &self,
+        folder: &Path,
+        options: &MapOptions,
+        subject: &Subject,
+        observer: &dyn Observer,
+    ) -> Result<PlantModel, MapError>;
+}
+
+/// Opens a detector.
+pub type OpenDetector = dyn Fn() -> Result<Arc<dyn Detector>, DetectionError> + Send + Sync;
+
+/// The pipeline with its detector, which is opened at the first job and kept.
+pub struct PipelineMapper {
+    open: Box<OpenDetector>,
+    detector: Mutex<Option<Arc<dyn Detector>>>,
+}
+
+impl PipelineMapper {
+    /// A mapper whose detector `open` gives.
+    pub fn new(open: Box<OpenDetector>) -> Self {
+        Self { open, detector: Mutex::new(None) }
+    }
+
+    fn detector(&self) -> Result<Arc<dyn Detector>, MapError> {
+        let mut kept = self.detector.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        if let Some(detector) = &*kept {
+            return Ok(detector.clone());
+        }
+        let detector = (self.open)().map_err(|error| MapError::Environment { message: error.to_string() })?;
+        tracing::info!(detector = detector.describe(), "detector opened");
+        *kept = Some(detector.clone());
+        Ok(detector)
+    }
+}
+
+impl Mapper for PipelineMapper {
+    fn map(
+        &self,
+        folder: &Path,
+        options: &MapOptions,
+        subject: &Subject,
+        observer: &dyn Observer,
+    ) -> Result<PlantModel, MapError> {
+        let detector = self.detector()?;
+        let mapping = pipeline::map_folder(folder, Boxes::Detector(&*detector), options, subject, observer)?;
+        for timing in &mapping.timings {
+            tracing::debug!(stage = timing.stage.as_str(), seconds = timing.wall.as_secs_f64(), "stage finished");
+        }
+        Ok(mapping.model)
+    }
+}

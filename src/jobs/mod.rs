@@ -1,0 +1,32 @@
+//! The queue's workers: a job is one run of the pipeline over a survey. A worker holds no transaction while it
+//! computes: a short claim, a lease with heartbeat, a fenced completion.
+
+pub mod mapper;
+pub mod readiness;
+pub mod worker;
+
+mod folder;
+mod rows;
+mod watch;
+
+pub use mapper::{Mapper, PipelineMapper};
+pub use readiness::{Missing, missing};
+pub use worker::{Worker, WorkerSettings};
+
+use crate::pipeline::MapError;
+use crate::store::StoreError;
+
+/// Why an attempt at a job made no model.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum AttemptError {
+    #[error(transparent)]
+    Map(#[from] MapError),
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    #[error("prepare the folder of the job: {0}")]
+    Folder(#[from] std::io::Error),
+    #[error("the plant's model {version} cannot be read: {source}")]
+    PreviousModel { version: u32, source: serde_json::Error },
+    #[error("the mapper panicked")]
+    Panicked,
+}

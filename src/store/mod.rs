@@ -1,0 +1,127 @@
+//! What the service remembers: rows in a database behind one trait, bytes in a blob store.
+//!
+//! A method of [`Store`] is one atomic action of the domain: it happens as a whole or not at all, whoever dies in
+//! between. Statements are written once in `sql.rs`; a backend holds only what differs.
+
+pub mod blobs;
+pub mod records;
+pub mod sqlite;
+pub mod survey_path;
+
+mod sql;
+
+pub use blobs::{Blobs, Digest, StagedFile};
+pub use records::{
+    Cancelled, Claim, Completed, Created, Ending, Enqueued, Feature, FeatureQuery, FileRecord, FileWritten, GeoBox,
+    Heartbeat, Job, JobId, JobRequest, JobState, LayerInfo, Model, NewFeature, NewLayer, NewModel, Page, Plant,
+    Progress, Survey, SurveyId,
+};
+pub use sqlite::SqliteStore;
+pub use survey_path::{Content, FileKind, ImageName, InvalidPath, SurveyPath};
+
+use crate::plant::{Layer, ModuleId, PlantId};
+use jiff::Timestamp;
+use std::time::Duration;
+
+/// Why the store could not do as told.
+#[derive(Debug, thiserror::Error)]
+pub enum StoreError {
+    /// The row that a new row belongs to was deleted meanwhile.
+    #[error("the {what} is gone")]
+    Gone { what: &'static str },
+    /// The database failed.
+    #[error("database: {0}")]
+    Database(#[from] sqlx::Error),
+    /// The database's schema could not be brought up to date.
+    #[error("database schema: {0}")]
+    Migration(#[from] sqlx::migrate::MigrateError),
+    /// The blob store failed.
+    #[error("blob store: {0}")]
+    Blob(#[from] object_store::Error),
+    /// The file system failed.
+    #[error("{action} {path}: {source}")]
+    Io { action: &'static str, path: std::path::PathBuf, source: std::io::Error },
+    /// A row holds what no version of this program writes.
+    #[error("the {what} holds `{value}`, which is none")]
+    Corrupt { what: &'static str, value: String },
+}
+
+impl StoreError {
+    /// Whether the disk is full.
+    pub fn is_full(&self) -> bool {
+        let full = |error: &std::io::Error| error.kind() == std::io::ErrorKind::StorageFull;
+        match self {
+            Self::Io { source, .. } => full(source),
+            // SQLITE_FULL
+            Self::Database(sqlx::Error::Database(error)) => error.code().as_deref() == Some("13"),
+            _ => false,
+        }
+    }
+}
+
+/// The rows. Absence is `Ok(None)`; the time comes in from the caller.
+#[async_trait::async_trait]
+pub trait Store: Send + Sync + 'static {
+    /// Fails where the database does not answer.
+    async fn ping(&self) -> Result<(), StoreError>;
+
+    /// Creates a plant, or finds the one of that name.
+    async fn create_plant(&self, name: &str, now: Timestamp) -> Result<Created<Plant>, StoreError>;
+    /// One plant.
+    async fn plant(&self, id: PlantId) -> Result<Option<Plant>, StoreError>;
+    /// Plants in the order of their creation.
+    async fn plants(&self, page: Page) -> Result<Vec<Plant>, StoreError>;
+    /// Deletes a plant with every row that belongs to it; whether there was one. Its workers lose their jobs.
+    async fn delete_plant(&self, id: PlantId) -> Result<bool, StoreError>;
+
+    /// Creates a survey of a plant, or finds the one of that name.
+    async fn create_survey(&self, plant: PlantId, name: &str, now: Timestamp) -> Result<Created<Survey>, StoreError>;
+    /// One survey of a plant.
+    async fn survey(&self, plant: PlantId, id: SurveyId) -> Result<Option<Survey>, StoreError>;
+    /// A plant's surveys in the order of their creation.
+    async fn surveys(&self, plant: PlantId, page: Page) -> Result<Vec<Survey>, StoreError>;
+
+    /// Puts files into a survey, all or none; a file at the same path is replaced. One answer per file, in order.
+    async fn put_files(&self, survey: SurveyId, files: &[FileRecord]) -> Result<Vec<FileWritten>, StoreError>;
+    /// A survey's files, sorted by path.
+    async fn files(&self, survey: SurveyId) -> Result<Vec<FileRecord>, StoreError>;
+
+    /// Queues a mapping of a survey, or finds its unfinished job.
+    async fn enqueue_job(&self, request: &JobRequest, now: Timestamp) -> Result<Enqueued, StoreError>;
+    /// One job of a plant.
+    async fn job(&self, plant: PlantId, id: JobId) -> Result<Option<Job>, StoreError>;
+    /// A plant's jobs, or those of one survey, the newest first.
+    async fn jobs(&self, plant: PlantId, survey: Option<SurveyId>, page: Page) -> Result<Vec<Job>, StoreError>;
+    /// Cancels a queued job at once, asks a running one to stop, leaves a finished one.
+    async fn cancel_job(&self, plant: PlantId, id: JobId, now: Timestamp) -> Result<Option<Cancelled>, StoreError>;
+
+    /// Takes the oldest job that may run: queued and due, or abandoned by its worker; of a plant none of whose jobs
+    /// runs. Ends jobs that were abandoned too often. The attempt is counted here, so that a job that kills its worker
+    /// does not run for ever.
+    async fn claim_job(&self, worker: &str, lease: Duration, now: Timestamp) -> Result<Option<Claim>, StoreError>;
+    /// Extends the lease of a claimed job and records its progress.
+    async fn heartbeat(
+        &self,
+        claim: &Claim,
+        progress: Option<Progress>,
+        lease: Duration,
+        now: Timestamp,
+    ) -> Result<Heartbeat, StoreError>;
+    /// Ends a claimed job with its model: the job's end and the model appear together.
+    async fn complete_job(&self, claim: &Claim, model: &NewModel, now: Timestamp) -> Result<Completed, StoreError>;
+    /// Ends a claimed job without a model, or puts it back; `false` where the claim was lost.
+    async fn end_job(&self, claim: &Claim, ending: &Ending, now: Timestamp) -> Result<bool, StoreError>;
+
+    /// A plant's models, the newest first.
+    async fn models(&self, plant: PlantId, page: Page) -> Result<Vec<Model>, StoreError>;
+    /// One model of a plant; the newest where no version is given.
+    async fn model(&self, plant: PlantId, version: Option<u32>) -> Result<Option<Model>, StoreError>;
+    /// What a layer of a model holds.
+    async fn layer(&self, model: &Model, layer: Layer) -> Result<Option<LayerInfo>, StoreError>;
+    /// Features of a layer in the order of the model.
+    async fn features(&self, layer: &LayerInfo, query: FeatureQuery) -> Result<Vec<Feature>, StoreError>;
+    /// One module of a model.
+    async fn module(&self, model: &Model, id: ModuleId) -> Result<Option<String>, StoreError>;
+    /// The newest version of a plant's model that holds a module.
+    async fn module_last_seen(&self, plant: PlantId, id: ModuleId) -> Result<Option<u32>, StoreError>;
+}

@@ -1,0 +1,149 @@
+//! Every statement that both databases understand, written once. Parameters are `$n`, times are milliseconds,
+//! identifiers and documents are text.
+
+macro_rules! plant {
+    () => {
+        "seq, id, name, created_ms"
+    };
+}
+macro_rules! survey {
+    () => {
+        "seq, id, plant_id, name, created_ms"
+    };
+}
+macro_rules! job {
+    () => {
+        "seq, id, plant_id, survey_id, state, options, stage, done, total, warnings, error_code, error_message, attempt, \
+         max_attempts, fence, cancel_requested, model_version, created_ms, started_ms, finished_ms"
+    };
+}
+macro_rules! model {
+    () => {
+        "seq, plant_id, version, survey_id, job_id, sha256, size, warnings, created_ms"
+    };
+}
+
+pub const PING: &str = "SELECT 1";
+
+pub const CREATE_PLANT: &str = concat!(
+    "INSERT INTO plants (id, name, created_ms) VALUES ($1, $2, $3) ON CONFLICT (name) DO NOTHING RETURNING ",
+    plant!()
+);
+pub const PLANT_BY_NAME: &str = concat!("SELECT ", plant!(), " FROM plants WHERE name = $1");
+pub const PLANT: &str = concat!("SELECT ", plant!(), " FROM plants WHERE id = $1");
+pub const PLANTS: &str = concat!("SELECT ", plant!(), " FROM plants WHERE seq > $1 ORDER BY seq LIMIT $2");
+pub const DELETE_PLANT: &str = "DELETE FROM plants WHERE id = $1";
+
+pub const CREATE_SURVEY: &str = concat!(
+    "INSERT INTO surveys (id, plant_id, name, created_ms) VALUES ($1, $2, $3, $4) \
+     ON CONFLICT (plant_id, name) DO NOTHING RETURNING ",
+    survey!()
+);
+pub const SURVEY_BY_NAME: &str = concat!("SELECT ", survey!(), " FROM surveys WHERE plant_id = $1 AND name = $2");
+pub const SURVEY: &str = concat!("SELECT ", survey!(), " FROM surveys WHERE plant_id = $1 AND id = $2");
+pub const SURVEYS: &str =
+    concat!("SELECT ", survey!(), " FROM surveys WHERE plant_id = $1 AND seq > $2 ORDER BY seq LIMIT $3");
+
+pub const FILE_DIGEST: &str = "SELECT sha256 FROM files WHERE survey_id = $1 AND path = $2";
+pub const PUT_FILE: &str = "\
+    INSERT INTO files (survey_id, path, kind, size, sha256, width_px, height_px, stored_ms) \
+    VALUES ($1, $2, $3, $4, $5, $6, $7, $8) \
+    ON CONFLICT (survey_id, path) DO UPDATE SET kind = excluded.kind, size = excluded.size, sha256 = excluded.sha256, \
+    width_px = excluded.width_px, height_px = excluded.height_px, stored_ms = excluded.stored_ms";
+pub const FILES: &str = "\
+    SELECT path, size, sha256, width_px, height_px, stored_ms FROM files WHERE survey_id = $1 ORDER BY path";
+
+pub const ENQUEUE_JOB: &str = concat!(
+    "INSERT INTO jobs (id, plant_id, survey_id, state, options, max_attempts, run_after_ms, created_ms) \
+     VALUES ($1, $2, $3, 'queued', $4, $5, $6, $6) \
+     ON CONFLICT (survey_id) WHERE state IN ('queued', 'running') DO NOTHING RETURNING ",
+    job!()
+);
+pub const UNFINISHED_JOB: &str =
+    concat!("SELECT ", job!(), " FROM jobs WHERE survey_id = $1 AND state IN ('queued', 'running')");
+pub const JOB: &str = concat!("SELECT ", job!(), " FROM jobs WHERE plant_id = $1 AND id = $2");
+pub const JOBS_OF_PLANT: &str =
+    concat!("SELECT ", job!(), " FROM jobs WHERE plant_id = $1 AND seq < $2 ORDER BY seq DESC LIMIT $3");
+pub const JOBS_OF_SURVEY: &str = concat!(
+    "SELECT ",
+    job!(),
+    " FROM jobs WHERE plant_id = $1 AND survey_id = $4 AND seq < $2 ORDER BY seq DESC LIMIT $3"
+);
+pub const CANCEL_JOB: &str = concat!(
+    "UPDATE jobs SET cancel_requested = TRUE, \
+     finished_ms = CASE WHEN state = 'queued' THEN $3 ELSE finished_ms END, \
+     state = CASE WHEN state = 'queued' THEN 'cancelled' ELSE state END \
+     WHERE plant_id = $1 AND id = $2 AND state IN ('queued', 'running') RETURNING ",
+    job!()
+);
+
+/// Ends jobs whose worker fell silent and that were cancelled or had their last attempt.
+pub const BURY_ABANDONED_JOBS: &str = "\
+    UPDATE jobs SET finished_ms = $1, lease_until_ms = NULL, \
+    error_code = CASE WHEN cancel_requested THEN error_code ELSE 'worker_lost' END, \
+    error_message = CASE WHEN cancel_requested THEN error_message ELSE $2 END, \
+    state = CASE WHEN cancel_requested THEN 'cancelled' ELSE 'failed' END \
+    WHERE state = 'running' AND lease_until_ms < $1 AND (cancel_requested OR attempt >= max_attempts)";
+pub const CLAIM_JOB: &str = concat!(
+    "UPDATE jobs SET state = 'running', worker = $1, attempt = attempt + 1, fence = fence + 1, lease_until_ms = $3, \
+     started_ms = COALESCE(started_ms, $2), stage = NULL, done = 0, total = 0 \
+     WHERE seq = (SELECT candidate.seq FROM jobs AS candidate \
+     WHERE ((candidate.state = 'queued' AND candidate.run_after_ms <= $2) \
+     OR (candidate.state = 'running' AND candidate.lease_until_ms < $2)) \
+     AND NOT EXISTS (SELECT 1 FROM jobs AS other WHERE other.plant_id = candidate.plant_id \
+     AND other.seq <> candidate.seq AND other.state = 'running' AND other.lease_until_ms >= $2) \
+     ORDER BY candidate.seq LIMIT 1) RETURNING ",
+    job!()
+);
+pub const HEARTBEAT: &str = "\
+    UPDATE jobs SET lease_until_ms = $3, stage = COALESCE($4, stage), done = COALESCE($5, done), \
+    total = COALESCE($6, total) WHERE id = $1 AND fence = $2 AND state = 'running' RETURNING cancel_requested";
+pub const COMPLETE_JOB: &str = "\
+    UPDATE jobs SET state = 'succeeded', finished_ms = $3, lease_until_ms = NULL, warnings = $4, model_version = $5, \
+    error_code = NULL, error_message = NULL WHERE id = $1 AND fence = $2 AND state = 'running'";
+/// `$3` the state, `$4` code, `$5` message, `$6` the time from which to try again, `$7` the time of the end.
+pub const END_JOB: &str = "\
+    UPDATE jobs SET state = $3, error_code = COALESCE($4, error_code), error_message = COALESCE($5, error_message), \
+    run_after_ms = COALESCE($6, run_after_ms), finished_ms = $7, lease_until_ms = NULL, attempt = attempt - $8 \
+    WHERE id = $1 AND fence = $2 AND state = 'running'";
+
+pub const INSERT_MODEL: &str = concat!(
+    "INSERT INTO models (plant_id, version, survey_id, job_id, sha256, size, warnings, created_ms) \
+     VALUES ($1, $2, $3, $4, $5, $6, $7, $8) ON CONFLICT (plant_id, version) DO NOTHING RETURNING ",
+    model!()
+);
+pub const INSERT_LAYER: &str = "\
+    INSERT INTO layers (model_seq, layer, features, properties, min_lon, min_lat, max_lon, max_lat, tallest_deg) \
+    VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9)";
+pub const INSERT_FEATURE: &str = "\
+    INSERT INTO features (model_seq, layer, seq, id, label, feature, min_lon, min_lat, max_lon, max_lat) \
+    VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10)";
+
+pub const MODELS: &str =
+    concat!("SELECT ", model!(), " FROM models WHERE plant_id = $1 AND seq < $2 ORDER BY seq DESC LIMIT $3");
+pub const MODEL: &str = concat!("SELECT ", model!(), " FROM models WHERE plant_id = $1 AND version = $2");
+pub const NEWEST_MODEL: &str =
+    concat!("SELECT ", model!(), " FROM models WHERE plant_id = $1 ORDER BY version DESC LIMIT 1");
+pub const LAYER: &str = "\
+    SELECT features, properties, min_lon, min_lat, max_lon, max_lat, tallest_deg FROM layers \
+    WHERE model_seq = $1 AND layer = $2";
+
+pub const FEATURES: &str = "\
+    SELECT seq, feature FROM features WHERE model_seq = $1 AND layer = $2 AND seq > $3 ORDER BY seq LIMIT $4";
+/// A box that covers much of the layer: walk the layer in order and leave out what lies elsewhere. The unary plus
+/// keeps the planner from the index by place.
+pub const FEATURES_IN_LARGE_BOX: &str = "\
+    SELECT seq, feature FROM features WHERE model_seq = $1 AND layer = $2 AND seq > $3 \
+    AND +min_lon <= $7 AND +max_lon >= $5 AND +min_lat <= $8 AND +max_lat >= $6 ORDER BY seq LIMIT $4";
+/// A box that covers little of the layer: take the strip of latitudes from the index by place (which holds all that
+/// the condition asks for) and put what is in the box in order. `$9` is the southernmost latitude at which a feature
+/// that reaches into the box may begin.
+pub const FEATURES_IN_SMALL_BOX: &str = "\
+    SELECT seq, feature FROM features WHERE model_seq = $1 AND layer = $2 AND seq IN (SELECT near.seq \
+    FROM features AS near WHERE near.model_seq = $1 AND near.layer = $2 AND near.min_lat BETWEEN $9 AND $8 \
+    AND near.max_lat >= $6 AND near.min_lon <= $7 AND near.max_lon >= $5 AND +near.seq > $3 \
+    ORDER BY +near.seq LIMIT $4) ORDER BY seq";
+pub const MODULE: &str = "SELECT feature FROM features WHERE id = $1 AND model_seq = $2 AND layer = 'modules'";
+pub const MODULE_LAST_SEEN: &str = "\
+    SELECT models.version FROM features JOIN models ON models.seq = features.model_seq \
+    WHERE features.id = $1 AND features.layer = 'modules' AND models.plant_id = $2 ORDER BY models.version DESC LIMIT 1";

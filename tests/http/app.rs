@@ -1,0 +1,308 @@
+//! A service of its own for each test.
+
+use heliomap::config::Limits;
+use heliomap::geometry::{GeodeticReference, Lla};
+use heliomap::http::{AppState, router};
+use heliomap::jobs::{Mapper, Worker, WorkerSettings};
+use heliomap::pipeline::{MapError, MapOptions, Observer, Stage, Subject};
+use heliomap::plant::{
+    Bench, BenchId, Line, LineId, Module, ModuleId, ModuleStatus, PlantModel, Sector, SectorId, Warning,
+};
+use heliomap::store::{Blobs, SqliteStore, Store};
+use nalgebra::Vector3;
+use reqwest::{Client, Method, RequestBuilder, Response, StatusCode};
+use serde_json::{Value, json};
+use std::collections::VecDeque;
+use std::path::Path;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+use tempfile::TempDir;
+use tokio::sync::Notify;
+use tokio_util::sync::{CancellationToken, DropGuard};
+
+/// What the mapper does when it is called.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Act {
+    /// Maps a plant of so many columns.
+    Map(u32),
+    RefuseInput,
+    FailEnvironment,
+    Panic,
+    /// Waits to be cancelled.
+    Wait,
+}
+
+/// Does as it is told, then as it was told last.
+pub struct ScriptedMapper {
+    acts: Mutex<VecDeque<Act>>,
+    /// The files of the folders it was given.
+    pub seen: Mutex<Vec<Vec<String>>>,
+}
+
+impl Mapper for ScriptedMapper {
+    fn map(
+        &self,
+        folder: &Path,
+        options: &MapOptions,
+        subject: &Subject,
+        observer: &dyn Observer,
+    ) -> Result<PlantModel, MapError> {
+        let mut files = Vec::new();
+        list(folder, folder, &mut files);
+        files.sort();
+        self.seen.lock().unwrap().push(files);
+        let act = {
+            let mut acts = self.acts.lock().unwrap();
+            if acts.len() > 1 { acts.pop_front().unwrap() } else { acts[0] }
+        };
+        observer.progress(Stage::Detect, 1, 2);
+        match act {
+            Act::Map(columns) => Ok(model(subject, options, columns)),
+            Act::RefuseInput => {
+                Err(MapError::Input { code: "no_modules", message: "no photo shows a module; fly higher".to_owned() })
+            }
+            Act::FailEnvironment => Err(MapError::Environment { message: "the detector cannot be loaded".to_owned() }),
+            Act::Panic => panic!("as it was told"),
+            Act::Wait => {
+                while !observer.cancelled() {
+                    std::thread::sleep(Duration::from_millis(2));
+                }
+                Err(MapError::Cancelled)
+            }
+        }
+    }
+}
+
+fn list(root: &Path, folder: &Path, files: &mut Vec<String>) {
+    for entry in std::fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        match path.is_dir() {
+            true => list(root, &path, files),
+            false => files.push(path.strip_prefix(root).unwrap().to_str().unwrap().to_owned()),
+        }
+    }
+}
+
+/// One bench of one row, `columns` modules of 1 m with 1 m between their centres; identifiers persist.
+fn model(subject: &Subject, options: &MapOptions, columns: u32) -> PlantModel {
+    let plant = subject.plant;
+    let (line, bench, sector) =
+        (LineId::from_serial(plant, 1), BenchId::from_serial(plant, 1), SectorId::from_serial(plant, 1));
+    let known = subject.previous.as_ref().map_or(0, |previous| previous.serials[3]);
+    let modules = (1..=columns).map(|number| {
+        let west = f64::from(number - 1);
+        Module {
+            id: ModuleId::from_serial(plant, u64::from(number)),
+            label: format!("L01-B01-R1-{number:03}"),
+            line,
+            bench,
+            sector,
+            row: 1,
+            number,
+            corners_enu_m: [[0.0, 0.0], [0.9, 0.0], [0.9, 1.6], [0.0, 1.6]]
+                .map(|[x, y]| Vector3::new(west + x, y, 2.0)),
+            center_enu_m: Vector3::new(west + 0.45, 0.8, 2.0),
+            normal_enu: Vector3::z(),
+            width_m: 0.9,
+            height_m: 1.6,
+            sigma_enu_m: None,
+            images: vec!["a.jpg".to_owned(), "b.jpg".to_owned()],
+            status: ModuleStatus::Detected,
+        }
+    });
+    PlantModel {
+        plant,
+        plant_name: subject.plant_name.clone(),
+        version: subject.previous.as_ref().map_or(1, |previous| previous.version + 1),
+        survey: subject.survey.clone(),
+        reference: GeodeticReference::new(Lla { latitude_deg: 50.0, longitude_deg: 8.0, height_m: 100.0 }),
+        vertical_datum: "as the drone wrote it".to_owned(),
+        lines: vec![Line { id: line, label: "L01".to_owned(), index: 1 }],
+        benches: vec![Bench {
+            id: bench,
+            label: "L01-B01".to_owned(),
+            line,
+            index: 1,
+            rows: options.rows_per_bench.unwrap_or(1),
+            columns,
+            open_ended: [false; 2],
+            confidence: 1.0,
+        }],
+        sectors: vec![Sector { id: sector, label: "L01-B01-R1".to_owned(), line, bench, row: 1 }],
+        modules: modules.collect(),
+        warnings: vec![Warning::new("high_image", "b.jpg does not resolve modules", ["b.jpg".to_owned()])],
+        serials: [1, 1, 1, known.max(u64::from(columns))],
+    }
+}
+
+/// A service that runs until it is dropped.
+pub struct App {
+    pub base: String,
+    pub client: Client,
+    pub mapper: Arc<ScriptedMapper>,
+    pub folder: TempDir,
+    _stop: DropGuard,
+}
+
+impl App {
+    /// With a worker whose mapper acts so.
+    pub async fn new(acts: &[Act]) -> Self {
+        Self::with_limits(acts, Limits::default()).await
+    }
+
+    /// With limits of its own.
+    pub async fn with_limits(acts: &[Act], limits: Limits) -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let store: Arc<dyn Store> = Arc::new(SqliteStore::open(&folder.path().join("heliomap.db")).await.unwrap());
+        let blobs = Blobs::in_folder(folder.path()).unwrap();
+        let bell = Arc::new(Notify::new());
+        let mapper =
+            Arc::new(ScriptedMapper { acts: Mutex::new(acts.iter().copied().collect()), seen: Mutex::default() });
+        let stop = CancellationToken::new();
+        if !acts.is_empty() {
+            let worker = Worker {
+                name: "test".to_owned(),
+                store: store.clone(),
+                blobs: blobs.clone(),
+                mapper: mapper.clone(),
+                settings: WorkerSettings {
+                    lease: Duration::from_secs(10),
+                    heartbeat: Duration::from_millis(10),
+                    poll: Duration::from_millis(20),
+                    backoff: Duration::from_millis(10),
+                },
+                bell: bell.clone(),
+            };
+            let stop = stop.clone();
+            tokio::spawn(async move { worker.run(stop).await });
+        }
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let base = format!("http://{}", listener.local_addr().unwrap());
+        let app = router(AppState { store, blobs, limits: Arc::new(limits), bell });
+        tokio::spawn(axum::serve(listener, app).with_graceful_shutdown(stop.clone().cancelled_owned()).into_future());
+        Self { base, client: Client::new(), mapper, folder, _stop: stop.drop_guard() }
+    }
+
+    pub fn request(&self, method: Method, path: &str) -> RequestBuilder {
+        self.client.request(method, format!("{}{path}", self.base))
+    }
+
+    pub async fn get(&self, path: &str) -> (StatusCode, Value) {
+        json_of(self.request(Method::GET, path).send().await.unwrap()).await
+    }
+
+    pub async fn post(&self, path: &str, body: Value) -> (StatusCode, Value) {
+        json_of(self.request(Method::POST, path).json(&body).send().await.unwrap()).await
+    }
+
+    pub async fn put(&self, path: &str, body: impl Into<reqwest::Body>) -> (StatusCode, Value) {
+        json_of(self.request(Method::PUT, path).body(body).send().await.unwrap()).await
+    }
+
+    /// The path of a new plant.
+    pub async fn plant(&self) -> String {
+        let (status, plant) = self.post("/api/v1/plants", json!({"name": "Sunfield"})).await;
+        assert_eq!(status, StatusCode::CREATED, "{plant}");
+        format!("/api/v1/plants/{}", plant["id"].as_str().unwrap())
+    }
+
+    /// The path of a new survey of a new plant.
+    pub async fn survey(&self) -> String {
+        let plant = self.plant().await;
+        let (status, survey) = self.post(&format!("{plant}/surveys"), json!({"name": "June"})).await;
+        assert_eq!(status, StatusCode::CREATED, "{survey}");
+        format!("{plant}/surveys/{}", survey["id"].as_str().unwrap())
+    }
+
+    /// The path of a survey that can be mapped.
+    pub async fn complete_survey(&self) -> String {
+        let survey = self.survey().await;
+        self.fill(&survey).await;
+        survey
+    }
+
+    /// Uploads what a survey needs.
+    pub async fn fill(&self, survey: &str) {
+        for name in ["a.jpg", "b.jpg"] {
+            let (status, answer) = self.put(&format!("{survey}/images/{name}"), jpeg(32, 24)).await;
+            assert_eq!(status, StatusCode::CREATED, "{answer}");
+        }
+        for (path, body) in [("reconstruction.json", "[{\"shots\": {}}]"), ("reference_lla.json", "{\"latitude\": 50}")]
+        {
+            let (status, answer) = self.put(&format!("{survey}/reconstruction/{path}"), body).await;
+            assert_eq!(status, StatusCode::CREATED, "{answer}");
+        }
+    }
+
+    /// Starts a job and follows it to its end.
+    pub async fn map(&self, survey: &str) -> Value {
+        let (status, job) = self.post(&format!("{survey}/jobs"), json!({})).await;
+        assert_eq!(status, StatusCode::ACCEPTED, "{job}");
+        self.follow(&job).await
+    }
+
+    /// Follows a job to its end.
+    pub async fn follow(&self, job: &Value) -> Value {
+        self.follow_until(job, |job| {
+            ["succeeded", "failed", "cancelled"].contains(&job["state"].as_str().unwrap_or_default())
+        })
+        .await
+    }
+
+    /// Follows a job until it is as wanted.
+    pub async fn follow_until(&self, job: &Value, wanted: impl Fn(&Value) -> bool) -> Value {
+        let path = job_path(job);
+        for _ in 0..2000 {
+            let (_, job) = self.get(&path).await;
+            if wanted(&job) {
+                return job;
+            }
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+        panic!("the job does not get there: {}", self.get(&path).await.1);
+    }
+}
+
+pub fn job_path(job: &Value) -> String {
+    format!("/api/v1/plants/{}/jobs/{}", job["plant"].as_str().unwrap(), job["id"].as_str().unwrap())
+}
+
+/// The plant's path from one of its surveys.
+pub fn plant_path(survey: &str) -> &str {
+    survey.split_once("/surveys/").unwrap().0
+}
+
+pub async fn json_of(response: Response) -> (StatusCode, Value) {
+    let status = response.status();
+    let kind = response.headers().get("content-type").map(|kind| kind.to_str().unwrap().to_owned());
+    let text = response.text().await.unwrap();
+    if status.is_client_error() || status.is_server_error() {
+        assert_eq!(kind.as_deref(), Some("application/problem+json"), "{status}: {text}");
+    }
+    let value = if text.is_empty() { Value::Null } else { serde_json::from_str(&text).unwrap_or(Value::String(text)) };
+    (status, value)
+}
+
+/// Asserts that an answer is the problem wanted and that its detail names what it is about.
+#[track_caller]
+pub fn assert_problem((status, problem): (StatusCode, Value), expected: u16, code: &str, names: &str) {
+    assert_eq!(status.as_u16(), expected, "{problem}");
+    assert_eq!(problem["code"], code, "{problem}");
+    assert_eq!(problem["status"], expected, "{problem}");
+    let detail = problem["detail"].as_str().unwrap();
+    assert!(detail.contains(names), "`{names}` is not in `{detail}`");
+}
+
+/// A photo.
+pub fn jpeg(width: u32, height: u32) -> Vec<u8> {
+    encoded(width, height, image::ImageFormat::Jpeg)
+}
+
+/// A photo in some format.
+pub fn encoded(width: u32, height: u32, format: image::ImageFormat) -> Vec<u8> {
+    let photo =
+        image::RgbImage::from_fn(width, height, |x, y| image::Rgb([(x * 9) as u8, (y * 7) as u8, (x ^ y) as u8]));
+    let mut bytes = std::io::Cursor::new(Vec::new());
+    photo.write_to(&mut bytes, format).unwrap();
+    bytes.into_inner()
+}

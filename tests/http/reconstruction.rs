@@ -1,0 +1,194 @@
+use crate::app::{App, assert_problem, encoded, jpeg};
+use flate2::Compression;
+use flate2::write::GzEncoder;
+use heliomap::config::Limits;
+use reqwest::StatusCode;
+use serde_json::{Value, json};
+use std::io::{Cursor, Write};
+use zip::write::SimpleFileOptions;
+
+const RECONSTRUCTION: &[u8] = b"[{\"shots\": {}}]";
+const REFERENCE: &[u8] = b"{\"latitude\": 50.0, \"longitude\": 8.0, \"altitude\": 0.0}";
+
+fn zip(entries: &[(&str, &[u8])]) -> Vec<u8> {
+    let mut archive = zip::ZipWriter::new(Cursor::new(Vec::new()));
+    for (name, bytes) in entries {
+        archive.start_file(*name, SimpleFileOptions::default()).unwrap();
+        archive.write_all(bytes).unwrap();
+    }
+    archive.finish().unwrap().into_inner()
+}
+
+/// A tar with names as they are, however bad.
+fn tar(entries: &[(&str, tar::EntryType, &[u8])]) -> Vec<u8> {
+    let mut archive = tar::Builder::new(Vec::new());
+    for (name, kind, bytes) in entries {
+        let mut header = tar::Header::new_ustar();
+        header.as_mut_bytes()[..name.len()].copy_from_slice(name.as_bytes());
+        header.set_entry_type(*kind);
+        header.set_size(bytes.len() as u64);
+        header.set_mode(0o644);
+        if kind.is_symlink() {
+            header.set_link_name("/etc/passwd").unwrap();
+        }
+        header.set_cksum();
+        archive.append(&header, *bytes).unwrap();
+    }
+    archive.into_inner().unwrap()
+}
+
+fn gzip(bytes: &[u8]) -> Vec<u8> {
+    let mut encoder = GzEncoder::new(Vec::new(), Compression::default());
+    encoder.write_all(bytes).unwrap();
+    encoder.finish().unwrap()
+}
+
+fn paths(survey: &Value) -> Vec<&str> {
+    survey["files"].as_array().unwrap().iter().map(|file| file["path"].as_str().unwrap()).collect()
+}
+
+#[tokio::test]
+async fn a_survey_says_what_it_lacks() {
+    let app = App::new(&[]).await;
+    let survey = app.survey().await;
+    let missing = async || {
+        let (_, survey) = app.get(&survey).await;
+        let codes: Vec<String> =
+            survey["missing"].as_array().unwrap().iter().map(|m| m["code"].as_str().unwrap().to_owned()).collect();
+        assert_eq!(survey["complete"], json!(codes.is_empty()));
+        codes
+    };
+    assert_eq!(missing().await, ["too_few_images", "no_reconstruction", "no_reference"]);
+    let (status, problem) = app.post(&format!("{survey}/jobs"), json!({})).await;
+    assert_eq!((status.as_u16(), &problem["code"]), (409, &json!("survey_incomplete")));
+    assert_eq!(problem["missing"][1]["code"], "no_reconstruction");
+    app.fill(&survey).await;
+    assert!(missing().await.is_empty());
+}
+
+#[tokio::test]
+async fn files_of_a_reconstruction_are_checked() {
+    let app = App::new(&[]).await;
+    let survey = app.survey().await;
+    let put = async |path: &str, body: &[u8]| app.put(&format!("{survey}/reconstruction/{path}"), body.to_vec()).await;
+    for (path, body) in [
+        ("reconstruction.json", RECONSTRUCTION),
+        ("reference_lla.json", REFERENCE),
+        ("camera_models.json", b"{}".as_slice()),
+        ("undistorted/reconstruction.json", RECONSTRUCTION),
+        ("undistorted/undistorted_shot_ids.json", b"{}"),
+        ("undistorted/images/a.JPG.jpg", &jpeg(8, 8)),
+        ("undistorted/depthmaps/merged.ply", b"ply\nformat ascii 1.0\n"),
+    ] {
+        let (status, answer) = put(path, body).await;
+        assert_eq!((status, &answer["path"]), (StatusCode::CREATED, &json!(path)), "{answer}");
+    }
+    assert_problem(put("reports/x.json", b"{}").await, 422, "unknown_file", "reports/x.json");
+    assert_problem(put("../reconstruction.json", b"[]").await, 404, "not_found", "");
+    assert_problem(put("..%2freconstruction.json", b"[]").await, 422, "unknown_file", "..");
+    assert_problem(
+        put("reconstruction.json", b"{}").await,
+        422,
+        "file_unreadable",
+        "reconstruction.json is no JSON array",
+    );
+    assert_problem(put("reconstruction.json", b"[{").await, 422, "file_unreadable", "cut short");
+    assert_problem(put("reconstruction.json", b"").await, 422, "file_unreadable", "empty");
+    assert_problem(put("reconstruction.json", b"[NaN]").await, 422, "file_unreadable", "NaN");
+    assert_problem(put("reference_lla.json", b"[]").await, 422, "file_unreadable", "reference_lla.json");
+    assert_problem(put("undistorted/depthmaps/merged.ply", b"plop").await, 422, "file_unreadable", "merged.ply");
+    assert_problem(put("undistorted/images/a.jpg", b"x").await, 422, "image_unreadable", "undistorted/images/a.jpg");
+}
+
+#[tokio::test]
+async fn an_archive_of_a_whole_folder_makes_a_survey_complete() {
+    let photo = jpeg(8, 8);
+    let app = App::new(&[]).await;
+    let entries: Vec<(&str, &[u8])> = vec![
+        ("project/", b""),
+        ("project/images/a.jpg", &photo),
+        ("project/images/b.jpg", &photo),
+        ("project/reconstruction.json", RECONSTRUCTION),
+        ("project/reference_lla.json", REFERENCE),
+        ("project/undistorted/reconstruction.json", RECONSTRUCTION),
+        ("project/undistorted/images/thumbs/x.jpg", b"not known"),
+        ("project/backup/reconstruction.json", b"older"),
+        ("project/reports/stats.json", b"{}"),
+    ];
+    let files: Vec<_> = entries
+        .iter()
+        .filter(|(name, _)| !name.ends_with('/'))
+        .map(|(n, b)| (*n, tar::EntryType::Regular, *b))
+        .collect();
+    let expected = [
+        "images/a.jpg",
+        "images/b.jpg",
+        "reconstruction.json",
+        "reference_lla.json",
+        "undistorted/reconstruction.json",
+    ];
+    for (name, archive) in [("zip", zip(&entries[1..])), ("tar", tar(&files)), ("tar.gz", gzip(&tar(&files)))] {
+        let plant = app.post("/api/v1/plants", json!({"name": name})).await.1;
+        let surveys = format!("/api/v1/plants/{}/surveys", plant["id"].as_str().unwrap());
+        let survey = app.post(&surveys, json!({"name": "x"})).await.1;
+        let survey = format!("{surveys}/{}", survey["id"].as_str().unwrap());
+        let (status, answer) = app.put(&format!("{survey}/reconstruction"), archive).await;
+        assert_eq!(status, StatusCode::OK, "{name}: {answer}");
+        assert_eq!(answer["ignored_count"], 3, "{name}: {answer}");
+        let (_, survey) = app.get(&survey).await;
+        assert_eq!((paths(&survey).as_slice(), &survey["complete"]), (expected.as_slice(), &json!(true)), "{name}");
+    }
+    assert_eq!(std::fs::read_dir(app.folder.path().join("incoming")).unwrap().count(), 0);
+}
+
+#[tokio::test]
+async fn bad_archives_are_refused_as_a_whole() {
+    use tar::EntryType::{Fifo, Regular, Symlink};
+    let limits = Limits { max_entries: 5, max_unpacked_size: 1 << 20, ..Limits::default() };
+    let app = App::with_limits(&[], limits).await;
+    let survey = app.survey().await;
+    let put = async |body: Vec<u8>| app.put(&format!("{survey}/reconstruction"), body).await;
+    let good = ("reconstruction.json", RECONSTRUCTION);
+    let file = ("reconstruction.json", Regular, RECONSTRUCTION);
+
+    assert_problem(put(b"hello".to_vec()).await, 415, "unsupported_archive", "zip");
+    assert_problem(put(Vec::new()).await, 415, "unsupported_archive", "zip");
+    assert_problem(put(b"PK\x03\x04rest".to_vec()).await, 422, "archive_unreadable", "");
+    assert_problem(put(zip(&[("x.txt", b"")])).await, 422, "archive_empty", "reconstruction.json");
+    for name in ["../x.json", "a/../../x", "/etc/x", "C:\\x", "..\\x"] {
+        assert_problem(put(zip(&[good, (name, b"x")])).await, 422, "archive_unsafe", name);
+        assert_problem(put(tar(&[file, (name, Regular, b"x")])).await, 422, "archive_unsafe", name);
+    }
+    assert_problem(put(tar(&[file, ("x", Symlink, b"")])).await, 422, "archive_unsafe", "`x` is a link");
+    assert_problem(put(tar(&[file, ("x", Fifo, b"")])).await, 422, "archive_unsafe", "`x`");
+    let mut linked = zip::ZipWriter::new(Cursor::new(zip(&[good])));
+    linked.add_symlink("images/a.jpg", "/etc/passwd", SimpleFileOptions::default()).unwrap();
+    let linked = linked.finish().unwrap().into_inner();
+    assert_problem(put(linked).await, 422, "archive_unsafe", "images/a.jpg");
+
+    let zeros = vec![b' '; 2 << 20];
+    assert_problem(put(zip(&[good, ("big", &zeros)])).await, 413, "archive_too_large", "1048576");
+    assert_problem(put(gzip(&tar(&[file, ("big", Regular, &zeros)]))).await, 413, "archive_too_large", "1048576");
+    let many: Vec<(&str, &[u8])> = ["1", "2", "3", "4", "5", "6"].map(|name| (name, b"".as_slice())).to_vec();
+    assert_problem(put(zip(&many)).await, 413, "archive_too_large", "5 entries");
+    let cut = gzip(&tar(&[file]));
+    assert_problem(put(cut[..cut.len() / 2].to_vec()).await, 422, "archive_unreadable", "");
+
+    let png = encoded(8, 8, image::ImageFormat::Png);
+    assert_problem(put(zip(&[good, ("images/a.jpg", &png)])).await, 422, "image_format_mismatch", "images/a.jpg");
+    assert_problem(put(zip(&[("reconstruction.json", b"{}")])).await, 422, "file_unreadable", "reconstruction.json");
+    let twice = tar(&[file, file]);
+    assert_problem(put(twice).await, 422, "archive_unsafe", "reconstruction.json");
+
+    assert!(paths(&app.get(&survey).await.1).is_empty());
+    assert_eq!(std::fs::read_dir(app.folder.path().join("incoming")).unwrap().count(), 0);
+}
+
+#[tokio::test]
+async fn an_archive_may_not_unpack_to_many_times_its_size() {
+    let app = App::with_limits(&[], Limits { max_unpacked_ratio: 10, ..Limits::default() }).await;
+    let survey = app.survey().await;
+    let zeros = vec![b' '; 80 << 20];
+    let bomb = zip(&[("reconstruction.json", &zeros)]);
+    assert_problem(app.put(&format!("{survey}/reconstruction"), bomb).await, 413, "archive_too_large", "bytes");
+}
