@@ -1,8 +1,20 @@
-//! From an image to the modules in it.
+//! From an image to the modules in it (paper, 3.2).
+//!
+//! A semantic network ([`Unet`]) marks the pixels of modules; [`mask_to_boxes`] turns its masks into oriented boxes;
+//! [`filter`] drops what no module can be. An instance network may complement it behind the same [`Detector`].
 
 pub mod external;
+pub mod filter;
+pub mod mask_to_boxes;
+mod neighbours;
+pub mod probability;
+pub mod runtime;
+mod unet;
+
+pub use unet::Unet;
 
 use crate::geometry::Quad;
+use image::RgbImage;
 use serde::{Deserialize, Serialize};
 
 /// Which detector found a module.
@@ -35,4 +47,58 @@ pub struct ImageDetections {
     pub width_px: u32,
     pub height_px: u32,
     pub detections: Vec<Detection>,
+}
+
+/// Something that finds modules in an image.
+pub trait Detector: Sync {
+    /// The modules that lie wholly inside `image` (8-bit RGB, free of distortion), in pixels of `image`. `gsd_m` is its
+    /// ground sampling distance in metres per pixel, where it is known.
+    ///
+    /// # Errors
+    /// Inference that fails, or gives numbers that are none.
+    fn detect(&self, image: &RgbImage, gsd_m: Option<f64>) -> Result<Vec<Detection>, DetectionError>;
+
+    /// One line for people: which model, which version, what runs it.
+    fn describe(&self) -> String;
+}
+
+/// Why nothing can be detected. Each sentence says what to do.
+#[derive(Debug, thiserror::Error)]
+pub enum DetectionError {
+    #[error(
+        "ONNX Runtime is not installed: run `make setup`, or set ORT_DYLIB_PATH to libonnxruntime.so (1.24 or newer)"
+    )]
+    RuntimeMissing,
+    #[error("ONNX Runtime cannot be loaded from {library}: {what}; run `make setup`, or set ORT_DYLIB_PATH to another")]
+    RuntimeUnusable { library: String, what: String },
+    #[error("the model {name} cannot be read: {source}")]
+    ModelUnreadable { name: String, source: std::io::Error },
+    #[error("the model {name} is larger than the {limit} bytes that are read")]
+    ModelTooLarge { name: String, limit: u64 },
+    #[error("{name} is no ONNX model: {what}")]
+    NotAModel { name: String, what: String },
+    #[error("the model {name} does not fit: {what}")]
+    UnfitModel { name: String, what: String },
+    #[error("the network failed: {what}")]
+    Inference { what: String },
+    #[error(
+        "the network gave no numbers for {percent:.0} % of the pixels: the model is damaged, or unfit for this machine"
+    )]
+    NotFinite { percent: f64 },
+}
+
+impl DetectionError {
+    /// A stable word for programs.
+    pub fn code(&self) -> &'static str {
+        match self {
+            Self::RuntimeMissing => "onnx_runtime_missing",
+            Self::RuntimeUnusable { .. } => "onnx_runtime_unusable",
+            Self::ModelUnreadable { .. } => "model_unreadable",
+            Self::ModelTooLarge { .. } => "model_too_large",
+            Self::NotAModel { .. } => "model_invalid",
+            Self::UnfitModel { .. } => "model_unfit",
+            Self::Inference { .. } => "inference_failed",
+            Self::NotFinite { .. } => "model_output_not_finite",
+        }
+    }
 }

@@ -1,0 +1,235 @@
+//! ONNX Runtime: found, loaded once, and asked to open models that are checked before they are trusted.
+
+use super::DetectionError;
+use ort::environment::Environment;
+use ort::session::Session;
+use ort::session::builder::GraphOptimizationLevel;
+use ort::value::TensorElementType;
+use std::ffi::OsString;
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+
+/// The largest model file that is read.
+pub const MAX_MODEL_BYTES: u64 = 512 << 20;
+
+/// The execution provider that runs the models.
+pub const EXECUTION_PROVIDER: &str = "CPU";
+
+static ENVIRONMENT: Mutex<Option<Environment>> = Mutex::new(None);
+
+/// The process's ONNX Runtime; loaded at the first call. A failure is not remembered: the library may be installed
+/// while the process runs.
+fn environment() -> Result<Environment, DetectionError> {
+    let mut slot = ENVIRONMENT.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    if let Some(environment) = slot.as_ref() {
+        return Ok(environment.clone());
+    }
+    let named = std::env::var_os("ORT_DYLIB_PATH").filter(|path| !path.is_empty());
+    let is_named = named.is_some();
+    let library = find_library(named, std::env::current_dir().ok(), std::env::current_exe().ok())?;
+    let unusable = |what: String| DetectionError::RuntimeUnusable { library: library.display().to_string(), what };
+    let environment = ort::init_from(&library)
+        .map_err(|error| match error {
+            ort::LoadDynamicError::Dlopen { .. } if !is_named && is_bare(&library) => DetectionError::RuntimeMissing,
+            error => unusable(error.to_string()),
+        })?
+        .with_name("heliomap")
+        .with_telemetry(false)
+        .build()
+        .map_err(|error| unusable(error.to_string()))?;
+    environment.set_log_level(ort::logging::LogLevel::Fatal);
+    Ok(slot.insert(environment).clone())
+}
+
+/// The name under which the system's loader knows the library.
+fn system_name() -> String {
+    format!("{}onnxruntime{}", std::env::consts::DLL_PREFIX, std::env::consts::DLL_SUFFIX)
+}
+
+/// Whether a path is a name without a folder, which is for the system's loader to find.
+fn is_bare(path: &Path) -> bool {
+    path.components().count() == 1
+}
+
+/// Where the library is: what `named` says, else `.ort/` in the working directory, beside the executable or in one of
+/// its parents, else the system's own.
+fn find_library(
+    named: Option<OsString>,
+    working_directory: Option<PathBuf>,
+    executable: Option<PathBuf>,
+) -> Result<PathBuf, DetectionError> {
+    if let Some(named) = named.map(PathBuf::from) {
+        return if is_bare(&named) || named.is_file() {
+            Ok(named)
+        } else {
+            Err(DetectionError::RuntimeUnusable {
+                library: named.display().to_string(),
+                what: "no such file (ORT_DYLIB_PATH names it)".to_owned(),
+            })
+        };
+    }
+    let beside_executable = executable.iter().flat_map(|path| path.ancestors().skip(1));
+    let found = working_directory
+        .as_deref()
+        .into_iter()
+        .chain(beside_executable)
+        .map(|folder| folder.join(".ort").join(system_name()))
+        .find(|path| path.is_file());
+    Ok(found.unwrap_or_else(|| PathBuf::from(system_name())))
+}
+
+/// What a segmentation model of one image input and one mask output declares about itself.
+pub(super) struct SegmentationModel {
+    pub session: Session,
+    pub input: String,
+    pub output: String,
+    /// Height and width that the input is bound to, where it is.
+    pub fixed_size: [Option<u32>; 2],
+    /// Metadata by key, without the prefix `heliomap.`.
+    pub metadata: std::collections::BTreeMap<String, String>,
+    /// SHA-256 of the file, hexadecimal.
+    pub digest: String,
+}
+
+/// Reads a model file and opens it with `threads` threads (0: one per core), on one float32 input `[N, 3, H, W]` and one
+/// float32 output `[N, C, sH, sW]`.
+///
+/// # Errors
+/// No runtime; a file that cannot be read, is too large, is no ONNX model or one of another shape.
+pub(super) fn open_segmentation(path: &Path, threads: usize) -> Result<SegmentationModel, DetectionError> {
+    let name = path.file_name().map_or_else(|| path.display().to_string(), |name| name.to_string_lossy().into_owned());
+    let bytes = read_bounded(path, &name)?;
+    let no_model = |what: String| DetectionError::NotAModel { name: name.clone(), what };
+    if bytes.is_empty() {
+        return Err(no_model("the file is empty".to_owned()));
+    }
+    let session = open_session(&bytes, threads, &name)?;
+    let unfit = |what: String| DetectionError::UnfitModel { name: name.clone(), what };
+    let shape_of = |outlet: &ort::value::Outlet| -> Option<Vec<i64>> {
+        let dtype = outlet.dtype();
+        (dtype.tensor_type() == Some(TensorElementType::Float32))
+            .then(|| dtype.tensor_shape().map(|shape| shape.iter().copied().collect()))
+            .flatten()
+    };
+    let describe = |outlets: &[ort::value::Outlet]| -> String {
+        let texts: Vec<String> = outlets.iter().map(|o| format!("{}: {}", o.name(), o.dtype())).collect();
+        if texts.is_empty() { "none".to_owned() } else { texts.join(", ") }
+    };
+    let [input] = session.inputs() else {
+        return Err(unfit(format!(
+            "it has the inputs {}; one is needed, float32 [N, 3, H, W]",
+            describe(session.inputs())
+        )));
+    };
+    let fits = |dim: i64, wanted: i64| dim == wanted || dim < 0;
+    let input_shape = shape_of(input)
+        .filter(|shape| shape.len() == 4 && fits(shape[0], 1) && fits(shape[1], 3))
+        .ok_or_else(|| unfit(format!("its input is {}; float32 [N, 3, H, W] is needed", describe(session.inputs()))))?;
+    let mut fixed_size = [None; 2];
+    for (fixed, dim) in fixed_size.iter_mut().zip(&input_shape[2..]) {
+        *fixed = match *dim {
+            dim if dim < 0 => None,
+            dim @ 64..=4096 => Some(dim as u32),
+            dim => return Err(unfit(format!("its input is bound to {dim} pixels; 64 to 4096, or any, are needed"))),
+        };
+    }
+    let outputs = session.outputs();
+    let output = outputs
+        .iter()
+        .find(|outlet| outlet.name() == "masks")
+        .or(if let [only] = outputs { Some(only) } else { None })
+        .filter(|outlet| {
+            shape_of(outlet).is_some_and(|shape| {
+                shape.len() == 4 && fits(shape[0], 1) && (shape[1] < 0 || (1..=64).contains(&shape[1]))
+            })
+        })
+        .ok_or_else(|| {
+            unfit(format!("its output is {}; one of float32 [N, C, H, W] is needed, named `masks`", describe(outputs)))
+        })?;
+    let metadata = {
+        let held = session.metadata().map_err(|error| no_model(error.to_string()))?;
+        let keys = held.custom_keys().map_err(|error| no_model(error.to_string()))?;
+        keys.iter().filter_map(|key| Some((key.strip_prefix("heliomap.")?.to_owned(), held.custom(key)?))).collect()
+    };
+    Ok(SegmentationModel {
+        input: input.name().to_owned(),
+        output: output.name().to_owned(),
+        fixed_size,
+        metadata,
+        digest: hexadecimal(&<sha2::Sha256 as sha2::Digest>::digest(&bytes)),
+        session,
+    })
+}
+
+fn hexadecimal(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+fn read_bounded(path: &Path, name: &str) -> Result<Vec<u8>, DetectionError> {
+    let unreadable = |source| DetectionError::ModelUnreadable { name: name.to_owned(), source };
+    let file = File::open(path).map_err(unreadable)?;
+    let size = file.metadata().map_err(unreadable)?;
+    if size.is_dir() {
+        return Err(DetectionError::NotAModel { name: name.to_owned(), what: "it is a folder".to_owned() });
+    }
+    let mut bytes = Vec::new();
+    file.take(MAX_MODEL_BYTES + 1).read_to_end(&mut bytes).map_err(unreadable)?;
+    if bytes.len() as u64 > MAX_MODEL_BYTES {
+        return Err(DetectionError::ModelTooLarge { name: name.to_owned(), limit: MAX_MODEL_BYTES });
+    }
+    Ok(bytes)
+}
+
+fn open_session(bytes: &[u8], threads: usize, name: &str) -> Result<Session, DetectionError> {
+    let environment = environment()?;
+    let no_model = |what: &str| DetectionError::NotAModel { name: name.to_owned(), what: first_line(what) };
+    let threads = if threads == 0 { available_threads() } else { threads };
+    let mut builder = Session::builder(&environment)
+        .map_err(|error| DetectionError::Inference { what: error.to_string() })?
+        .with_optimization_level(GraphOptimizationLevel::All)
+        .and_then(|builder| builder.with_intra_threads(threads))
+        .map_err(|error| DetectionError::Inference { what: error.to_string() })?;
+    builder.commit_from_memory(bytes).map_err(|error| no_model(error.message()))
+}
+
+/// Cores that this process may use.
+pub(super) fn available_threads() -> usize {
+    std::thread::available_parallelism().map_or(1, std::num::NonZero::get)
+}
+
+/// The first line of a message, of bounded length.
+fn first_line(text: &str) -> String {
+    text.lines().next().unwrap_or("").chars().take(300).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_named_library_comes_first_and_must_exist() {
+        let folder = tempfile::tempdir().unwrap();
+        let library = folder.path().join("lib.so");
+        std::fs::write(&library, b"").unwrap();
+        let found = find_library(Some(library.clone().into()), None, None).unwrap();
+        assert_eq!(found, library);
+        let missing = find_library(Some(folder.path().join("other.so").into()), None, None);
+        assert!(matches!(missing, Err(DetectionError::RuntimeUnusable { .. })));
+    }
+
+    #[test]
+    fn the_library_is_looked_for_in_the_working_directory_and_above_the_executable() {
+        let folder = tempfile::tempdir().unwrap();
+        let library = folder.path().join(".ort").join(system_name());
+        std::fs::create_dir(folder.path().join(".ort")).unwrap();
+        std::fs::write(&library, b"").unwrap();
+        let executable = folder.path().join("target/debug/heliomap");
+        assert_eq!(find_library(None, None, Some(executable.clone())).unwrap(), library);
+        assert_eq!(find_library(None, Some(folder.path().to_owned()), None).unwrap(), library);
+        let elsewhere = tempfile::tempdir().unwrap();
+        let found = find_library(None, Some(elsewhere.path().to_owned()), None).unwrap();
+        assert_eq!(found, PathBuf::from(system_name()));
+    }
+}
