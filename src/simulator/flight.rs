@@ -52,6 +52,18 @@ impl Flight {
         }
     }
 
+    /// [`Flight::plain`] in any direction, up to 20 degrees off the vertical, one way or both ways, 35 to 60 m high.
+    pub fn random(rng: &mut StdRng) -> Self {
+        Self {
+            altitude_m: rng.random_range(35.0..60.0),
+            heading_rad: std::f64::consts::PI * signed(rng),
+            both_directions: rng.random_bool(0.7),
+            tilt_rad: rng.random_range(0.0..=20.0_f64.to_radians()),
+            yaw_jitter_rad: rng.random_range(0.0..0.15),
+            ..Self::plain()
+        }
+    }
+
     /// About as many photos as the paper took of its first plant (Table 1), with its camera at half resolution (4).
     pub fn paper_pp1() -> Self {
         Self { altitude_m: 108.0, forward_overlap: 0.5, side_overlap: 0.5, ..Self::plain() }

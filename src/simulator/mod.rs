@@ -39,6 +39,7 @@ mod sfm;
 mod tests;
 
 pub use flight::Flight;
+pub use layouts::LayoutKind;
 pub use observe::Glare;
 pub use plant::{
     BenchSpec, BlockSpec, LineCurve, LineSpec, PlantSpec, PlantTruth, Terrain, TerrainWave, TruthBench, TruthLine,

@@ -343,3 +343,84 @@ fn what_is_wrong_is_named() {
     crossed.iter_mut().filter(|m| m.line == "L2").for_each(|m| m.line = String::from("L1"));
     assert!(!structure_report(&truth, &crossed).exact);
 }
+
+#[test]
+fn plants_of_every_kind_stand_free_and_compare_equal_to_themselves() {
+    for kind in LayoutKind::ALL {
+        for seed in 0..20 {
+            let spec = PlantSpec::random(kind, &mut rng(seed));
+            let truth = spec.build();
+            assert!((60..2500).contains(&truth.modules.len()), "{kind:?} has {} modules", truth.modules.len());
+            assert_eq!(truth.modules.len(), spec.modules());
+            let grid = ModuleGrid::new(&truth, 3.0);
+            for (index, module) in truth.modules.iter().enumerate() {
+                assert!(module.normal_enu().z > 0.7);
+                // No other module over or under its corners or its middle.
+                for place in module.corners_enu_m().iter().chain([&module.center_enu_m]) {
+                    let place = (place + (module.center_enu_m - place) * 0.02).xy();
+                    let near = grid.within(place - Vector2::repeat(3.0), place + Vector2::repeat(3.0));
+                    for other in near.filter(|other| *other != index) {
+                        assert!(
+                            truth.modules[other].place_on_face(place).amax() > 1.0,
+                            "{kind:?} {seed}: {other} {index}"
+                        );
+                    }
+                }
+                for corner in module.corners_enu_m() {
+                    let above_m = corner.z - truth.terrain.height_m(corner.xy());
+                    assert!(above_m > 0.0, "{kind:?} {seed}: {index} is {above_m} m above the ground");
+                }
+            }
+            let bent = |p: Vector3<f64>| p * 1.006 + Vector3::new(0.5, 0.5, 3.0);
+            let report = structure_report(&truth, &perfect(&truth, bent));
+            assert!(report.exact, "{kind:?} {seed}: {} {:?}", report.missing.len(), report.wrong_structure);
+        }
+    }
+}
+
+#[test]
+fn tables_look_south_and_trackers_to_either_side() {
+    for kind in LayoutKind::ALL {
+        let truth = PlantSpec::random(kind, &mut rng(1)).build();
+        for bench in &truth.benches {
+            let first = &truth.modules[bench.modules.start];
+            let last = &truth.modules[bench.modules.end - 1];
+            if kind == LayoutKind::Trackers {
+                assert!(first.center_enu_m.y > last.center_enu_m.y && first.normal_enu().y.abs() < 0.2);
+            } else {
+                assert!(first.center_enu_m.x < last.center_enu_m.x + 2.0 && first.normal_enu().y < -0.2);
+            }
+        }
+    }
+}
+
+#[test]
+fn curved_benches_bend_and_stepped_ones_are_level() {
+    let curved = PlantSpec::random_curved(&mut rng(3)).build();
+    let bends = curved.benches.iter().filter(|bench| {
+        let along = |col| curved.modules[bench.module(0, col).unwrap()].half_along_m.normalize();
+        along(0).angle(&along(bench.columns - 1)) > 0.01
+    });
+    assert!(bends.count() > curved.benches.len() / 2);
+    let stepped = PlantSpec::random_stepped(&mut rng(3)).build();
+    for bench in &stepped.benches {
+        let height = |col| stepped.modules[bench.module(0, col).unwrap()].center_enu_m.z;
+        assert!((height(0) - height(bench.columns - 1)).abs() < 1e-9);
+    }
+}
+
+#[test]
+fn every_module_of_every_kind_is_seen_from_any_flight() {
+    for kind in LayoutKind::ALL {
+        for seed in 0..3 {
+            let mut rng = rng(seed);
+            let spec = PlantSpec::random(kind, &mut rng);
+            let flight = Flight::random(&mut rng);
+            let simulation = simulate(&spec, &flight, &Errors::none().without_cloud(), seed);
+            let sightings = simulation.sightings();
+            let few = sightings.iter().filter(|count| **count < 2).count();
+            assert!(few * 100 < sightings.len(), "{kind:?} {seed}: {few} of {} seen less than twice", sightings.len());
+            assert!(sightings.iter().all(|count| *count > 0), "{kind:?} {seed}");
+        }
+    }
+}
