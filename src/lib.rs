@@ -1,7 +1,8 @@
 //! heliomap maps photovoltaic plants from drone overview photos.
 //!
 //! Each room may use what stands before it in this list, never what comes after: `geometry`, `reconstruction`,
-//! `detection`, `layout`, `fusion`, `refinement`, `plant`, `pipeline`; then `store` and `jobs`; then `http`.
+//! `detection`, `layout`, `fusion`, `refinement`, `plant`, `pipeline`; then `store` and `jobs`; then `http`. `overlay`
+//! and `evaluation` look at what the pipeline made; `simulator` makes plants with known truth for tests and benchmarks.
 
 pub mod config;
 pub mod detection;
@@ -15,5 +16,6 @@ pub mod pipeline;
 pub mod plant;
 pub mod reconstruction;
 pub mod refinement;
+pub mod simulator;
 pub mod store;
 pub mod telemetry;
