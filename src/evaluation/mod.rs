@@ -28,8 +28,8 @@ const MAX_WORST: usize = 10;
 /// Why a comparison could not be made. The sentences name the file and say what to do.
 #[derive(Debug, thiserror::Error)]
 pub enum EvaluateError {
-    #[error("cannot read {}: {source}", path.display())]
-    Read { path: PathBuf, source: std::io::Error },
+    #[error("cannot read {}: {reason}", path.display())]
+    Read { path: PathBuf, reason: String },
     #[error("{} is larger than {limit_bytes} bytes: evaluate a part of the plant", path.display())]
     TooLarge { path: PathBuf, limit_bytes: u64 },
     #[error("{} is not the JSON that is expected, at line {line}, column {column}: {reason}; give a GeoJSON file of modules or a truth.json", path.display())]

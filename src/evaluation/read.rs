@@ -23,7 +23,7 @@ const MAX_REACH_M: f64 = 200_000.0;
 /// Where the file cannot be read, is too large, or is not of the shape that is expected: each names the file, the
 /// feature or module, and what to do.
 pub fn read_model(path: &Path, frame: Option<GeodeticReference>) -> Result<ReferenceModel, EvaluateError> {
-    let read_error = |source| EvaluateError::Read { path: path.to_owned(), source };
+    let read_error = |error: std::io::Error| EvaluateError::Read { path: path.to_owned(), reason: error.to_string() };
     let file = std::fs::File::open(path).map_err(read_error)?;
     let mut bytes = Vec::new();
     file.take(MAX_BYTES + 1).read_to_end(&mut bytes).map_err(read_error)?;
