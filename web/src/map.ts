@@ -139,6 +139,9 @@ export class PlantMap {
     this.map.addControl(new NavigationControl({ visualizePitch: false }), "top-right");
     this.map.addControl(new ScaleControl({ maxWidth: 160 }), "bottom-left");
     this.ready = new Promise((resolve) => this.map.once("load", resolve));
+    // For tests: whether all is drawn.
+    this.map.on("render", () => (container.dataset["drawn"] = "partly"));
+    this.map.on("idle", () => (container.dataset["drawn"] = "all"));
     this.map.on("mousemove", (event) => this.hover(this.moduleAt(event.point)));
     this.map.on("mouseout", () => this.hover(undefined));
     this.map.on("click", (event) => pick(this.moduleAt(event.point)));

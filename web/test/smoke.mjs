@@ -28,7 +28,10 @@ try {
   const shot = async (name) => {
     if (shots) await page.screenshot({ path: join(shots, `${name}.png`) });
   };
-  const settled = () => page.waitForTimeout(1200);
+  const settled = async () => {
+    await page.waitForTimeout(500);
+    await page.locator('#map[data-drawn="all"]').waitFor();
+  };
   const status = page.locator("#status");
 
   await page.goto(address);
