@@ -257,9 +257,9 @@ impl Comparison<'_> {
             };
             let whole = if level == Level::LineOrder { "plant" } else { "line" };
             let number = index.unwrap_or_default();
-            let verb = if modules.len() == 1 { "module stands" } else { "modules stand" };
+            let verb = if modules.len() == 1 { "stands" } else { "stand" };
             let message = format!(
-                "{word} {name} is number {number} of its {whole}, but {} of its {verb} in number {expected}",
+                "{word} {name} is number {number} of its {whole}, but {} of its modules {verb} in number {expected}",
                 modules.len()
             );
             self.problem(level, message, &modules);
