@@ -28,7 +28,7 @@ pub struct EvaluateArgs {
 }
 
 /// Runs the comparison and prints it.
-pub fn run(args: EvaluateArgs) -> anyhow::Result<()> {
+pub fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     let truth = read_model(&args.truth, None)?;
     let plant = read_model(&args.plant, Some(truth.reference))?;
     let evaluation = evaluation::evaluate(&plant, &truth)?;
@@ -40,13 +40,13 @@ pub fn run(args: EvaluateArgs) -> anyhow::Result<()> {
     } else {
         write!(stdout, "{evaluation}")?;
     }
-    if let Some(path) = args.json.filter(|_| !to_stdout) {
+    if let Some(path) = args.json.as_ref().filter(|_| !to_stdout) {
         let mut json = serde_json::to_vec_pretty(&evaluation)?;
         json.push(b'\n');
-        std::fs::write(&path, json).with_context(|| format!("cannot write {}", path.display()))?;
+        std::fs::write(path, json).with_context(|| format!("cannot write {}", path.display()))?;
     }
-    if let Some(folder) = args.plots {
-        let written = evaluation::write_plots(&evaluation, &plant, &truth, &folder)?;
+    if let Some(folder) = &args.plots {
+        let written = evaluation::write_plots(&evaluation, &plant, &truth, folder)?;
         if !to_stdout {
             let names: Vec<String> = written.iter().map(|path| path.display().to_string()).collect();
             writeln!(stdout, "\nPlots: {}", names.join(", "))?;
