@@ -6,6 +6,7 @@
 
 pub mod config;
 pub mod detection;
+pub mod evaluation;
 pub mod fusion;
 pub mod geometry;
 pub mod http;

@@ -24,6 +24,8 @@ enum Command {
     Worker(WorkerArgs),
     /// Map the plant in a folder as OpenSfM leaves it; no server is needed.
     Map(commands::map::MapArgs),
+    /// Compare a plant with a truth or any reference model.
+    Evaluate(commands::evaluate::EvaluateArgs),
     /// Print the description of the HTTP API.
     Openapi(OpenapiArgs),
 }
@@ -35,6 +37,7 @@ fn main() -> anyhow::Result<()> {
         Command::Serve(args) => commands::serve::run(args),
         Command::Worker(args) => commands::worker::run(args),
         Command::Map(args) => commands::map::run(&args),
+        Command::Evaluate(args) => commands::evaluate::run(&args),
         Command::Openapi(args) => commands::openapi::run(&args),
     }
 }

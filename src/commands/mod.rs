@@ -1,5 +1,6 @@
 //! One file per command. Here alone, concrete backends are named.
 
+pub mod evaluate;
 pub mod map;
 pub mod openapi;
 pub mod serve;

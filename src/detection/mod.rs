@@ -50,7 +50,7 @@ pub struct ImageDetections {
 }
 
 /// Something that finds modules in an image.
-pub trait Detector: Sync {
+pub trait Detector: Send + Sync {
     /// The modules that lie wholly inside `image` (8-bit RGB, free of distortion), in pixels of `image`. `gsd_m` is its
     /// ground sampling distance in metres per pixel, where it is known.
     ///

@@ -1,0 +1,65 @@
+//! `heliomap evaluate`: a plant against a truth or any reference model.
+
+use anyhow::{Context, bail};
+use heliomap::evaluation::{self, read_model};
+use std::io::Write;
+use std::path::PathBuf;
+
+/// Compare a plant with a truth or any reference model.
+///
+/// Finds the alignment between both, pairs their modules, and reports modules found, missing and false, whether every
+/// module has its line, bench, row and number, and how far positions differ as is, after a rigid fit and after a
+/// similarity fit.
+#[derive(Debug, clap::Args)]
+pub struct EvaluateArgs {
+    /// GeoJSON of the plant's modules, as `heliomap map` writes it.
+    plant: PathBuf,
+    /// What it should be: a truth.json, or GeoJSON of modules.
+    truth: PathBuf,
+    /// Write everything as JSON too; `-` prints it in place of the text.
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+    /// Draw differences, spacing and the plant from above as SVG into this folder.
+    #[arg(long, value_name = "DIR")]
+    plots: Option<PathBuf>,
+    /// Fail unless every module is found, none is false and the structure is exact.
+    #[arg(long)]
+    strict: bool,
+}
+
+/// Runs the comparison and prints it.
+pub fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
+    let truth = read_model(&args.truth, None)?;
+    let plant = read_model(&args.plant, Some(truth.reference))?;
+    let evaluation = evaluation::evaluate(&plant, &truth)?;
+    let to_stdout = args.json.as_ref().is_some_and(|path| path.as_os_str() == "-");
+    let mut stdout = std::io::stdout().lock();
+    if to_stdout {
+        serde_json::to_writer_pretty(&mut stdout, &evaluation)?;
+        writeln!(stdout)?;
+    } else {
+        write!(stdout, "{evaluation}")?;
+    }
+    if let Some(path) = args.json.as_ref().filter(|_| !to_stdout) {
+        let mut json = serde_json::to_vec_pretty(&evaluation)?;
+        json.push(b'\n');
+        std::fs::write(path, json).with_context(|| format!("cannot write {}", path.display()))?;
+    }
+    if let Some(folder) = &args.plots {
+        let written = evaluation::write_plots(&evaluation, &plant, &truth, folder)?;
+        if !to_stdout {
+            let names: Vec<String> = written.iter().map(|path| path.display().to_string()).collect();
+            writeln!(stdout, "\nPlots: {}", names.join(", "))?;
+        }
+    }
+    stdout.flush()?;
+    if args.strict && !evaluation.is_flawless() {
+        bail!(
+            "{} missing, {} false, structure {}",
+            evaluation.missing.len(),
+            evaluation.false_modules.len(),
+            if evaluation.structure.exact { "exact" } else { "not exact" }
+        );
+    }
+    Ok(())
+}
