@@ -36,7 +36,10 @@ impl From<JsonRejection> for ApiError {
         let code = match &rejection {
             JsonRejection::JsonDataError(_) => Code::InvalidFields,
             JsonRejection::MissingJsonContentType(_) => {
-                return Self::new(Code::UnsupportedMediaType, "send JSON with the header `content-type: application/json`");
+                return Self::new(
+                    Code::UnsupportedMediaType,
+                    "send JSON with the header `content-type: application/json`",
+                );
             }
             JsonRejection::BytesRejection(error) if error.status() == axum::http::StatusCode::PAYLOAD_TOO_LARGE => {
                 Code::TooLarge

@@ -42,7 +42,9 @@ pub struct FeaturesQuery {
 impl FeaturesQuery {
     fn within(&self) -> Result<Option<GeoBox>, ApiError> {
         let Some(text) = &self.bbox else { return Ok(None) };
-        let wrong = |what| Err(ApiError::new(Code::InvalidQuery, format!("bbox {what}: give west,south,east,north in degrees")));
+        let wrong = |what| {
+            Err(ApiError::new(Code::InvalidQuery, format!("bbox {what}: give west,south,east,north in degrees")))
+        };
         let numbers: Option<Vec<f64>> =
             text.split(',').map(|part| part.trim().parse().ok().filter(|n: &f64| n.is_finite())).collect();
         let Some([min_lon, min_lat, max_lon, max_lat]) = numbers.and_then(|numbers| <[f64; 4]>::try_from(numbers).ok())

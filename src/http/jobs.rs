@@ -144,7 +144,8 @@ impl From<Warning> for WarningView {
 
 impl From<Job> for JobView {
     fn from(job: Job) -> Self {
-        let stage_number = |name: &str| Stage::ALL.iter().position(|stage| stage.as_str() == name).map_or(0, |at| at + 1);
+        let stage_number =
+            |name: &str| Stage::ALL.iter().position(|stage| stage.as_str() == name).map_or(0, |at| at + 1);
         Self {
             id: job.id,
             plant: job.plant,

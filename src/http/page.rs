@@ -30,8 +30,10 @@ pub async fn serve(method: Method, uri: Uri) -> Response {
         Some(file) => {
             // Built files carry a digest in their names.
             let caching = if path.starts_with("assets/") { "public, max-age=31536000, immutable" } else { "no-cache" };
-            let headers =
-                [(header::CONTENT_TYPE, file.metadata.mimetype().to_owned()), (header::CACHE_CONTROL, caching.to_owned())];
+            let headers = [
+                (header::CONTENT_TYPE, file.metadata.mimetype().to_owned()),
+                (header::CACHE_CONTROL, caching.to_owned()),
+            ];
             (headers, file.data).into_response()
         }
         None if path == "index.html" && method == Method::GET => Html(PLAIN).into_response(),

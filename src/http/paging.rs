@@ -56,7 +56,10 @@ impl PageQuery {
 /// Reads a cursor that this service gave.
 pub fn parse_cursor(cursor: &str) -> Result<i64, ApiError> {
     cursor.parse().ok().filter(|seq| *seq >= 0).ok_or_else(|| {
-        ApiError::new(Code::InvalidQuery, "the cursor is none of this service's: take it from the link to the next part")
+        ApiError::new(
+            Code::InvalidQuery,
+            "the cursor is none of this service's: take it from the link to the next part",
+        )
     })
 }
 

@@ -105,10 +105,7 @@ pub async fn list(
         (status = 404, description = "`plant_not_found`", body = Problem, content_type = "application/problem+json")
     )
 )]
-pub async fn get(
-    State(state): State<AppState>,
-    ApiPath(plant): ApiPath<PlantId>,
-) -> Result<Json<PlantView>, ApiError> {
+pub async fn get(State(state): State<AppState>, ApiPath(plant): ApiPath<PlantId>) -> Result<Json<PlantView>, ApiError> {
     Ok(Json(state.require_plant(plant).await?.into()))
 }
 

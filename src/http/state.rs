@@ -21,7 +21,10 @@ impl AppState {
     /// The plant, or a problem.
     pub async fn require_plant(&self, plant: PlantId) -> Result<Plant, ApiError> {
         self.store.plant(plant).await?.ok_or_else(|| {
-            ApiError::new(Code::PlantNotFound, format!("no plant has the identifier {plant}; GET /api/v1/plants lists them"))
+            ApiError::new(
+                Code::PlantNotFound,
+                format!("no plant has the identifier {plant}; GET /api/v1/plants lists them"),
+            )
         })
     }
 
@@ -33,7 +36,9 @@ impl AppState {
         self.require_plant(plant).await?;
         Err(ApiError::new(
             Code::SurveyNotFound,
-            format!("no survey of this plant has the identifier {survey}; GET /api/v1/plants/{plant}/surveys lists them"),
+            format!(
+                "no survey of this plant has the identifier {survey}; GET /api/v1/plants/{plant}/surveys lists them"
+            ),
         ))
     }
 }

@@ -6,9 +6,9 @@
 use super::AppState;
 use super::error::{ApiError, Code, Problem};
 use super::extract::ApiPath;
+use super::intake;
 use super::intake::archive::{self, ArchiveError, Unpacked};
 use super::intake::receive::{Bounds, drain, receive};
-use super::intake;
 use super::surveys::FileView;
 use crate::plant::PlantId;
 use crate::store::{Content, FileRecord, FileWritten, ImageName, StagedFile, StoreError, SurveyId, SurveyPath};
@@ -148,7 +148,7 @@ async fn put_one(
             Ok((status, Json(file)).into_response())
         }
         Err(problem) => {
-            drain(&mut body).await;
+            drain(&mut body, &problem).await;
             Err(problem)
         }
     }
@@ -228,8 +228,11 @@ pub async fn post_images(
         }
         let stored = async {
             let place = SurveyPath::of_image(&ImageName::parse(&name)?);
-            let bounds =
-                Bounds { name: place.as_str(), max_bytes: state.limits.max_image_size, idle: state.limits.request_timeout };
+            let bounds = Bounds {
+                name: place.as_str(),
+                max_bytes: state.limits.max_image_size,
+                idle: state.limits.request_timeout,
+            };
             let staged = receive(&mut part, state.blobs.staging(), bounds).await?;
             let checked = intake::check(&state, place, staged).await?;
             intake::store(&state, plant, survey, vec![checked]).await
@@ -316,8 +319,8 @@ pub async fn put_reconstruction(
         Ok(Json(UploadedArchive { files, ignored_count, ignored }))
     };
     let stored: Result<_, ApiError> = stored.await;
-    if stored.is_err() {
-        drain(&mut body).await;
+    if let Err(problem) = &stored {
+        drain(&mut body, problem).await;
     }
     stored
 }
@@ -368,4 +371,3 @@ async fn unpack(state: &AppState, archive: StagedFile) -> Result<Unpacked, ApiEr
         ApiError::new(code, error.to_string())
     })
 }
-

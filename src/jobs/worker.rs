@@ -221,9 +221,7 @@ impl Worker {
                 tracing::error!(%error, "the environment failed");
                 retry("environment", "the service's storage failed; its log says more".to_owned())
             }
-            AttemptError::Map(MapError::Cancelled)
-            | AttemptError::PreviousModel { .. }
-            | AttemptError::Panicked => {
+            AttemptError::Map(MapError::Cancelled) | AttemptError::PreviousModel { .. } | AttemptError::Panicked => {
                 tracing::error!(%error, "the mapping failed");
                 internal()
             }

@@ -4,8 +4,8 @@ use super::blobs::io;
 use super::sql;
 use super::{
     Cancelled, Claim, Completed, Created, Ending, Enqueued, Feature, FeatureQuery, FileRecord, FileWritten, GeoBox,
-    Heartbeat, Job, JobId, JobRequest, LayerInfo, Model, NewFeature, NewModel, Page, Plant, Progress, Store, StoreError,
-    Survey, SurveyId, SurveyPath,
+    Heartbeat, Job, JobId, JobRequest, LayerInfo, Model, NewFeature, NewModel, Page, Plant, Progress, Store,
+    StoreError, Survey, SurveyId, SurveyPath,
 };
 use crate::plant::{Layer, ModuleId, PlantId, Warning};
 use async_trait::async_trait;
@@ -99,7 +99,8 @@ impl Store for SqliteStore {
     }
 
     async fn plants(&self, page: Page) -> Result<Vec<Plant>, StoreError> {
-        let rows = sqlx::query(sql::PLANTS).bind(page.after.unwrap_or(0)).bind(page.limit).fetch_all(&self.read).await?;
+        let rows =
+            sqlx::query(sql::PLANTS).bind(page.after.unwrap_or(0)).bind(page.limit).fetch_all(&self.read).await?;
         rows.iter().map(plant).collect()
     }
 

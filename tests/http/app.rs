@@ -37,6 +37,8 @@ pub struct ScriptedMapper {
     acts: Mutex<VecDeque<Act>>,
     /// The files of the folders it was given.
     pub seen: Mutex<Vec<Vec<String>>>,
+    /// The end of the test, which waits for no mapper.
+    closing: CancellationToken,
 }
 
 impl Mapper for ScriptedMapper {
@@ -64,7 +66,7 @@ impl Mapper for ScriptedMapper {
             Act::FailEnvironment => Err(MapError::Environment { message: "the detector cannot be loaded".to_owned() }),
             Act::Panic => panic!("as it was told"),
             Act::Wait => {
-                while !observer.cancelled() {
+                while !observer.cancelled() && !self.closing.is_cancelled() {
                     std::thread::sleep(Duration::from_millis(2));
                 }
                 Err(MapError::Cancelled)
@@ -99,7 +101,8 @@ fn model(subject: &Subject, options: &MapOptions, columns: u32) -> PlantModel {
             sector,
             row: 1,
             number,
-            corners_enu_m: [[0.0, 0.0], [0.9, 0.0], [0.9, 1.6], [0.0, 1.6]].map(|[x, y]| Vector3::new(west + x, y, 2.0)),
+            corners_enu_m: [[0.0, 0.0], [0.9, 0.0], [0.9, 1.6], [0.0, 1.6]]
+                .map(|[x, y]| Vector3::new(west + x, y, 2.0)),
             center_enu_m: Vector3::new(west + 0.45, 0.8, 2.0),
             normal_enu: Vector3::z(),
             width_m: 0.9,
@@ -155,7 +158,8 @@ impl App {
         let store: Arc<dyn Store> = Arc::new(SqliteStore::open(&folder.path().join("heliomap.db")).await.unwrap());
         let blobs = Blobs::in_folder(folder.path()).unwrap();
         let bell = Arc::new(Notify::new());
-        let mapper = Arc::new(ScriptedMapper { acts: Mutex::new(acts.iter().copied().collect()), seen: Mutex::default() });
+        let mapper =
+            Arc::new(ScriptedMapper { acts: Mutex::new(acts.iter().copied().collect()), seen: Mutex::default() });
         let stop = CancellationToken::new();
         if !acts.is_empty() {
             let worker = Worker {
@@ -225,7 +229,8 @@ impl App {
             let (status, answer) = self.put(&format!("{survey}/images/{name}"), jpeg(32, 24)).await;
             assert_eq!(status, StatusCode::CREATED, "{answer}");
         }
-        for (path, body) in [("reconstruction.json", "[{\"shots\": {}}]"), ("reference_lla.json", "{\"latitude\": 50}")] {
+        for (path, body) in [("reconstruction.json", "[{\"shots\": {}}]"), ("reference_lla.json", "{\"latitude\": 50}")]
+        {
             let (status, answer) = self.put(&format!("{survey}/reconstruction/{path}"), body).await;
             assert_eq!(status, StatusCode::CREATED, "{answer}");
         }
@@ -297,7 +302,8 @@ pub fn jpeg(width: u32, height: u32) -> Vec<u8> {
 
 /// A photo in some format.
 pub fn encoded(width: u32, height: u32, format: image::ImageFormat) -> Vec<u8> {
-    let photo = image::RgbImage::from_fn(width, height, |x, y| image::Rgb([(x * 9) as u8, (y * 7) as u8, (x ^ y) as u8]));
+    let photo =
+        image::RgbImage::from_fn(width, height, |x, y| image::Rgb([(x * 9) as u8, (y * 7) as u8, (x ^ y) as u8]));
     let mut bytes = std::io::Cursor::new(Vec::new());
     photo.write_to(&mut bytes, format).unwrap();
     bytes.into_inner()

@@ -97,10 +97,17 @@ async fn many_photos_at_once_each_with_its_verdict() {
     assert_eq!(status, StatusCode::OK, "{answer}");
     assert_eq!(answer["files"][1]["path"], "images/b.jpg");
 
-    let (status, answer) = post(vec![("c.jpg", b"nothing".to_vec()), ("d.jpg", jpeg(8, 9)), ("a.jpg", jpeg(8, 8))]).await;
+    let (status, answer) =
+        post(vec![("c.jpg", b"nothing".to_vec()), ("d.jpg", jpeg(8, 9)), ("a.jpg", jpeg(8, 8))]).await;
     assert_eq!((status.as_u16(), &answer["code"]), (422, &json!("files_refused")));
-    assert_eq!((&answer["refused"][0]["name"], &answer["refused"][0]["code"]), (&json!("c.jpg"), &json!("image_unreadable")));
-    assert_eq!((&answer["files"][0]["result"], &answer["files"][1]["result"]), (&json!("created"), &json!("unchanged")));
+    assert_eq!(
+        (&answer["refused"][0]["name"], &answer["refused"][0]["code"]),
+        (&json!("c.jpg"), &json!("image_unreadable"))
+    );
+    assert_eq!(
+        (&answer["files"][0]["result"], &answer["files"][1]["result"]),
+        (&json!("created"), &json!("unchanged"))
+    );
     assert_eq!(files(&app, &survey).await, ["images/a.jpg", "images/b.jpg", "images/d.jpg"]);
 
     assert_problem(post(Vec::new()).await, 400, "bad_request", "");

@@ -44,7 +44,12 @@ async fn a_running_job_is_cancelled() {
     assert_problem(app.get(&format!("{}/models/latest", plant_path(&survey))).await, 404, "model_not_found", "");
     let next = app.map(&survey).await;
     assert_eq!(next["state"], "succeeded");
-    assert_problem(app.post(&format!("{}/cancel", job_path(&next)), json!(null)).await, 409, "job_finished", "succeeded");
+    assert_problem(
+        app.post(&format!("{}/cancel", job_path(&next)), json!(null)).await,
+        409,
+        "job_finished",
+        "succeeded",
+    );
     let (_, jobs) = app.get(&format!("{survey}/jobs")).await;
     let states: Vec<_> = jobs["items"].as_array().unwrap().iter().map(|job| job["state"].as_str().unwrap()).collect();
     assert_eq!(states, ["succeeded", "cancelled"]);

@@ -68,9 +68,13 @@ async fn parts_and_boxes() {
     let (_, rest) = app.get(two["links"][0]["href"].as_str().unwrap()).await;
     assert_eq!(labels(&rest), all[2..4]);
 
-    for (query, names) in
-        [("bbox=1,2,3", "bbox"), ("bbox=1,2,3,x", "bbox"), ("bbox=3,1,2,2", "bbox"), ("limit=0", "limit"), ("box=1", "box")]
-    {
+    for (query, names) in [
+        ("bbox=1,2,3", "bbox"),
+        ("bbox=1,2,3,x", "bbox"),
+        ("bbox=3,1,2,2", "bbox"),
+        ("limit=0", "limit"),
+        ("box=1", "box"),
+    ] {
         assert_problem(app.get(&format!("{modules}?{query}")).await, 400, "invalid_query", names);
     }
 }
@@ -87,8 +91,16 @@ async fn a_module_keeps_its_identifier_from_model_to_model() {
     assert_eq!(job["model_version"], 2);
 
     let (status, module) = app.get(&format!("{plant}/modules/{}", id(0))).await;
-    assert_eq!((status, &module["properties"]["label"]), (StatusCode::OK, &first["features"][0]["properties"]["label"]));
-    assert_problem(app.get(&format!("{plant}/modules/{}", id(2))).await, 404, "module_not_found", "newest that does is 1");
+    assert_eq!(
+        (status, &module["properties"]["label"]),
+        (StatusCode::OK, &first["features"][0]["properties"]["label"])
+    );
+    assert_problem(
+        app.get(&format!("{plant}/modules/{}", id(2))).await,
+        404,
+        "module_not_found",
+        "newest that does is 1",
+    );
     let (_, old) = app.get(&format!("{plant}/modules/{}?version=1", id(2))).await;
     assert_eq!(old, first["features"][2]);
     let bench = first["features"][0]["properties"]["bench"].as_str().unwrap();

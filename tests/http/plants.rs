@@ -54,7 +54,12 @@ async fn deleting_a_plant_deletes_everything_of_it() {
     assert_problem(app.get(plant).await, 404, "plant_not_found", "");
     assert_problem(app.get(&survey).await, 404, "plant_not_found", "");
     assert_problem(app.get(&format!("{plant}/models/latest/modules")).await, 404, "plant_not_found", "");
-    assert_problem(app.put(&format!("{survey}/images/a.jpg"), crate::app::jpeg(8, 8)).await, 404, "plant_not_found", "");
+    assert_problem(
+        app.put(&format!("{survey}/images/a.jpg"), crate::app::jpeg(8, 8)).await,
+        404,
+        "plant_not_found",
+        "",
+    );
     assert_eq!(std::fs::read_dir(&blobs).unwrap().count(), 0);
 }
 
@@ -71,7 +76,7 @@ async fn every_wrong_request_is_a_problem() {
     assert_problem(app.get(&format!("{plant}/models/latest")).await, 404, "model_not_found", "map");
 
     let patch = app.request(Method::PATCH, "/api/v1/plants").send().await.unwrap();
-    assert_eq!(patch.headers()["allow"], "GET,HEAD,POST");
+    assert_eq!(patch.headers()["allow"], "POST,GET,HEAD");
     assert_problem(json_of(patch).await, 405, "method_not_allowed", "allow");
     let form = app.request(Method::POST, "/api/v1/plants").body("{}").send().await.unwrap();
     assert_problem(json_of(form).await, 415, "unsupported_media_type", "application/json");

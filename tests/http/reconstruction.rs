@@ -86,7 +86,12 @@ async fn files_of_a_reconstruction_are_checked() {
     assert_problem(put("reports/x.json", b"{}").await, 422, "unknown_file", "reports/x.json");
     assert_problem(put("../reconstruction.json", b"[]").await, 404, "not_found", "");
     assert_problem(put("..%2freconstruction.json", b"[]").await, 422, "unknown_file", "..");
-    assert_problem(put("reconstruction.json", b"{}").await, 422, "file_unreadable", "reconstruction.json is no JSON array");
+    assert_problem(
+        put("reconstruction.json", b"{}").await,
+        422,
+        "file_unreadable",
+        "reconstruction.json is no JSON array",
+    );
     assert_problem(put("reconstruction.json", b"[{").await, 422, "file_unreadable", "cut short");
     assert_problem(put("reconstruction.json", b"").await, 422, "file_unreadable", "empty");
     assert_problem(put("reconstruction.json", b"[NaN]").await, 422, "file_unreadable", "NaN");
@@ -110,13 +115,19 @@ async fn an_archive_of_a_whole_folder_makes_a_survey_complete() {
         ("project/backup/reconstruction.json", b"older"),
         ("project/reports/stats.json", b"{}"),
     ];
-    let files: Vec<_> =
-        entries.iter().filter(|(name, _)| !name.ends_with('/')).map(|(n, b)| (*n, tar::EntryType::Regular, *b)).collect();
-    let expected =
-        ["images/a.jpg", "images/b.jpg", "reconstruction.json", "reference_lla.json", "undistorted/reconstruction.json"];
-    for (name, archive) in
-        [("zip", zip(&entries[1..])), ("tar", tar(&files)), ("tar.gz", gzip(&tar(&files)))]
-    {
+    let files: Vec<_> = entries
+        .iter()
+        .filter(|(name, _)| !name.ends_with('/'))
+        .map(|(n, b)| (*n, tar::EntryType::Regular, *b))
+        .collect();
+    let expected = [
+        "images/a.jpg",
+        "images/b.jpg",
+        "reconstruction.json",
+        "reference_lla.json",
+        "undistorted/reconstruction.json",
+    ];
+    for (name, archive) in [("zip", zip(&entries[1..])), ("tar", tar(&files)), ("tar.gz", gzip(&tar(&files)))] {
         let plant = app.post("/api/v1/plants", json!({"name": name})).await.1;
         let surveys = format!("/api/v1/plants/{}/surveys", plant["id"].as_str().unwrap());
         let survey = app.post(&surveys, json!({"name": "x"})).await.1;

@@ -198,8 +198,9 @@ impl Reader<'_> {
                 return Err(self.too_many());
             }
             let mut entry = entry.map_err(read_error)?;
-            let name = String::from_utf8(entry.path_bytes().into_owned())
-                .map_err(|error| unsafe_entry(&String::from_utf8_lossy(error.as_bytes()), "has a name that is no UTF-8"))?;
+            let name = String::from_utf8(entry.path_bytes().into_owned()).map_err(|error| {
+                unsafe_entry(&String::from_utf8_lossy(error.as_bytes()), "has a name that is no UTF-8")
+            })?;
             let name = name.strip_prefix("./").unwrap_or(&name).to_owned();
             let kind = entry.header().entry_type();
             if kind.is_dir() {
@@ -266,11 +267,8 @@ fn read_error(error: io::Error) -> ArchiveError {
 
 /// Copies an entry to a file of its own.
 fn stage(content: &mut dyn Read, folder: &Path) -> Result<StagedFile, ArchiveError> {
-    let (file, path) = tempfile::Builder::new()
-        .prefix("unpacked-")
-        .tempfile_in(folder)
-        .map_err(ArchiveError::Disk)?
-        .into_parts();
+    let (file, path) =
+        tempfile::Builder::new().prefix("unpacked-").tempfile_in(folder).map_err(ArchiveError::Disk)?.into_parts();
     let mut writer = BufWriter::with_capacity(CHUNK, file);
     let mut hasher = sha2::Sha256::new();
     let mut buffer = vec![0; CHUNK];

@@ -72,7 +72,10 @@ fn image(file: &Path, place: &SurveyPath, limits: &Limits) -> Result<[u32; 2], A
     let Some(found) = Format::of_content(&head) else {
         return Err(ApiError::new(
             Code::ImageUnreadable,
-            format!("{place} is no JPEG, PNG or TIFF image ({} bytes begin otherwise); send the photo itself", head.len()),
+            format!(
+                "{place} is no JPEG, PNG or TIFF image ({} bytes begin otherwise); send the photo itself",
+                head.len()
+            ),
         ));
     };
     if let Some(expected) = expected.filter(|expected| *expected != found) {
@@ -91,13 +94,11 @@ fn image(file: &Path, place: &SurveyPath, limits: &Limits) -> Result<[u32; 2], A
     reader.seek(SeekFrom::Start(0)).map_err(io)?;
     let within = |size: [u32; 2]| f64::from(size[0]) * f64::from(size[1]) <= limits.max_image_megapixels * 1e6;
     let size_px = match found {
-        Format::Jpeg => {
-            jpeg::walk(BufReader::with_capacity(1 << 16, reader), within).map_err(|error| match error {
-                JpegError::CutShort => cut_short(place),
-                JpegError::Malformed(what) => unreadable(place, what),
-                JpegError::Io(error) => io(error),
-            })?
-        }
+        Format::Jpeg => jpeg::walk(BufReader::with_capacity(1 << 16, reader), within).map_err(|error| match error {
+            JpegError::CutShort => cut_short(place),
+            JpegError::Malformed(what) => unreadable(place, what),
+            JpegError::Io(error) => io(error),
+        })?,
         Format::Png => png_size(reader, place)?,
         Format::Tiff => decoded_size(file, place, &within)?,
     };

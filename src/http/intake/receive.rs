@@ -46,7 +46,10 @@ where
                 tracing::debug!(%error, file = bounds.name, "upload interrupted");
                 return Err(ApiError::new(
                     Code::UploadInterrupted,
-                    format!("{} came in part only after {size} bytes; nothing of it was stored, send it again", bounds.name),
+                    format!(
+                        "{} came in part only after {size} bytes; nothing of it was stored, send it again",
+                        bounds.name
+                    ),
                 ));
             }
             Ok(Some(Ok(chunk))) => chunk,
@@ -65,10 +68,13 @@ where
 
 /// Takes the rest of a refused body, within reason: a client that is still sending when the connection closes does not
 /// get to read why.
-pub async fn drain<S, E>(mut body: S)
+pub async fn drain<S, E>(mut body: S, problem: &ApiError)
 where
     S: Stream<Item = Result<Bytes, E>> + Unpin,
 {
+    if matches!(problem.code, Code::UploadStalled | Code::UploadInterrupted) {
+        return;
+    }
     const MOST: usize = 16 << 20;
     let rest = async {
         let mut size = 0;
