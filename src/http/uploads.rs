@@ -148,7 +148,7 @@ async fn put_one(
             Ok((status, Json(file)).into_response())
         }
         Err(problem) => {
-            drain(&mut body).await;
+            drain(&mut body, &problem).await;
             Err(problem)
         }
     }
@@ -319,8 +319,8 @@ pub async fn put_reconstruction(
         Ok(Json(UploadedArchive { files, ignored_count, ignored }))
     };
     let stored: Result<_, ApiError> = stored.await;
-    if stored.is_err() {
-        drain(&mut body).await;
+    if let Err(problem) = &stored {
+        drain(&mut body, problem).await;
     }
     stored
 }

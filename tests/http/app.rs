@@ -37,6 +37,8 @@ pub struct ScriptedMapper {
     acts: Mutex<VecDeque<Act>>,
     /// The files of the folders it was given.
     pub seen: Mutex<Vec<Vec<String>>>,
+    /// The end of the test, which waits for no mapper.
+    closing: CancellationToken,
 }
 
 impl Mapper for ScriptedMapper {
@@ -64,7 +66,7 @@ impl Mapper for ScriptedMapper {
             Act::FailEnvironment => Err(MapError::Environment { message: "the detector cannot be loaded".to_owned() }),
             Act::Panic => panic!("as it was told"),
             Act::Wait => {
-                while !observer.cancelled() {
+                while !observer.cancelled() && !self.closing.is_cancelled() {
                     std::thread::sleep(Duration::from_millis(2));
                 }
                 Err(MapError::Cancelled)

@@ -76,7 +76,7 @@ async fn every_wrong_request_is_a_problem() {
     assert_problem(app.get(&format!("{plant}/models/latest")).await, 404, "model_not_found", "map");
 
     let patch = app.request(Method::PATCH, "/api/v1/plants").send().await.unwrap();
-    assert_eq!(patch.headers()["allow"], "GET,HEAD,POST");
+    assert_eq!(patch.headers()["allow"], "POST,GET,HEAD");
     assert_problem(json_of(patch).await, 405, "method_not_allowed", "allow");
     let form = app.request(Method::POST, "/api/v1/plants").body("{}").send().await.unwrap();
     assert_problem(json_of(form).await, 415, "unsupported_media_type", "application/json");

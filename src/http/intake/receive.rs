@@ -68,10 +68,13 @@ where
 
 /// Takes the rest of a refused body, within reason: a client that is still sending when the connection closes does not
 /// get to read why.
-pub async fn drain<S, E>(mut body: S)
+pub async fn drain<S, E>(mut body: S, problem: &ApiError)
 where
     S: Stream<Item = Result<Bytes, E>> + Unpin,
 {
+    if matches!(problem.code, Code::UploadStalled | Code::UploadInterrupted) {
+        return;
+    }
     const MOST: usize = 16 << 20;
     let rest = async {
         let mut size = 0;

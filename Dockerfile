@@ -1,0 +1,38 @@
+# The same steps as `make setup` and `cargo build`, in an image that holds only what the program needs to run.
+
+FROM node:20-bookworm AS web
+WORKDIR /heliomap
+COPY Makefile ./
+COPY web/ web/
+RUN make web
+
+FROM rust:1.95-bookworm AS build
+RUN apt-get update \
+    && apt-get install --yes --no-install-recommends make python3 python3-pip \
+    && rm -rf /var/lib/apt/lists/*
+WORKDIR /heliomap
+COPY Makefile ./
+RUN make .ort/libonnxruntime.so
+COPY Cargo.toml Cargo.lock ./
+COPY benches/ benches/
+COPY migrations/ migrations/
+COPY src/ src/
+COPY --from=web /heliomap/web/dist/ web/dist/
+RUN cargo build --release --locked --bin heliomap
+
+FROM debian:bookworm-slim
+RUN useradd --system --uid 10001 --home-dir /data heliomap \
+    && install --directory --owner=heliomap --group=heliomap /data
+COPY --from=build /heliomap/target/release/heliomap /usr/local/bin/heliomap
+COPY --from=build /heliomap/.ort/libonnxruntime.so /usr/local/lib/libonnxruntime.so
+COPY models/ /usr/local/share/heliomap/models/
+ENV ORT_DYLIB_PATH=/usr/local/lib/libonnxruntime.so \
+    HELIOMAP_DETECTOR=/usr/local/share/heliomap/models/unet.onnx \
+    HELIOMAP_DATA_DIR=/data \
+    HELIOMAP_LISTEN=0.0.0.0:8080 \
+    HELIOMAP_LOG_FORMAT=json
+USER heliomap
+VOLUME /data
+EXPOSE 8080
+ENTRYPOINT ["heliomap"]
+CMD ["serve"]

@@ -1,0 +1,156 @@
+//! The real program.
+
+use reqwest::StatusCode;
+use reqwest::blocking::Client;
+use serde_json::{Value, json};
+use std::io::{BufRead, BufReader};
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+/// A running program that is killed when dropped.
+struct Program(Child);
+
+impl Drop for Program {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+impl Program {
+    /// Asks it to stop as a service manager would; how it ended.
+    fn terminate(mut self) -> std::process::ExitStatus {
+        let kill = Command::new("kill").arg(self.0.id().to_string()).status().unwrap();
+        assert!(kill.success());
+        let begun = Instant::now();
+        loop {
+            if let Some(status) = self.0.try_wait().unwrap() {
+                return status;
+            }
+            assert!(begun.elapsed() < Duration::from_secs(20), "it does not stop");
+            std::thread::sleep(Duration::from_millis(10));
+        }
+    }
+}
+
+/// Starts the program; its first line of output.
+fn start(data: &Path, arguments: &[&str]) -> (Program, String) {
+    let mut child = Command::new(env!("CARGO_BIN_EXE_heliomap"))
+        .args(arguments)
+        .env("HELIOMAP_DATA_DIR", data)
+        .stdout(Stdio::piped())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    let mut line = String::new();
+    BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+    (Program(child), line)
+}
+
+fn serve(data: &Path, more: &[&str]) -> (Program, String) {
+    let (program, line) = start(data, &[&["serve", "--listen", "127.0.0.1:0"], more].concat());
+    let base = line.trim().strip_prefix("heliomap is listening on ").expect("the address is printed");
+    (program, base.to_owned())
+}
+
+fn jpeg() -> Vec<u8> {
+    let mut bytes = std::io::Cursor::new(Vec::new());
+    image::RgbImage::new(16, 12).write_to(&mut bytes, image::ImageFormat::Jpeg).unwrap();
+    bytes.into_inner()
+}
+
+/// A survey that looks complete but whose reconstruction is broken; its path and its job.
+fn broken_survey_with_job(client: &Client, base: &str) -> (String, Value) {
+    let post = |path: &str, body: Value| -> Value {
+        client.post(format!("{base}{path}")).json(&body).send().unwrap().json().unwrap()
+    };
+    let plant = post("/api/v1/plants", json!({"name": "Sunfield"}));
+    let surveys = format!("/api/v1/plants/{}/surveys", plant["id"].as_str().unwrap());
+    let survey = format!("{surveys}/{}", post(&surveys, json!({"name": "June"}))["id"].as_str().unwrap());
+    for (path, body) in [
+        ("images/a.jpg", jpeg()),
+        ("images/b.jpg", jpeg()),
+        ("reconstruction/reconstruction.json", b"[{\"shots\": 7}]".to_vec()),
+        ("reconstruction/reference_lla.json", b"{}".to_vec()),
+    ] {
+        let answer = client.put(format!("{base}{survey}/{path}")).body(body).send().unwrap();
+        assert_eq!(answer.status(), StatusCode::CREATED);
+    }
+    let job = post(&format!("{survey}/jobs"), json!({}));
+    (survey, job)
+}
+
+fn follow(client: &Client, base: &str, job: &Value) -> Value {
+    let path = format!("/api/v1/plants/{}/jobs/{}", job["plant"].as_str().unwrap(), job["id"].as_str().unwrap());
+    let begun = Instant::now();
+    loop {
+        let job: Value = client.get(format!("{base}{path}")).send().unwrap().json().unwrap();
+        if !["queued", "running"].contains(&job["state"].as_str().unwrap()) {
+            return job;
+        }
+        assert!(begun.elapsed() < Duration::from_secs(30), "{job}");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+}
+
+#[test]
+fn what_was_acknowledged_survives_a_kill_and_the_program_stops_when_told() {
+    let data = tempfile::tempdir().unwrap();
+    let client = Client::new();
+    let (program, base) = serve(data.path(), &["--no-worker"]);
+    let (survey, job) = broken_survey_with_job(&client, &base);
+    drop(program);
+
+    let (program, base) = serve(data.path(), &["--no-worker"]);
+    let found: Value = client.get(format!("{base}{survey}")).send().unwrap().json().unwrap();
+    assert_eq!((found["files"].as_array().unwrap().len(), &found["complete"]), (4, &json!(true)));
+    let jobs: Value = client.get(format!("{base}{survey}/jobs")).send().unwrap().json().unwrap();
+    assert_eq!((&jobs["items"][0]["id"], &jobs["items"][0]["state"]), (&job["id"], &json!("queued")));
+    assert!(program.terminate().success());
+}
+
+#[test]
+fn a_worker_of_its_own_takes_the_jobs_of_a_server_without_one() {
+    let data = tempfile::tempdir().unwrap();
+    let client = Client::new();
+    let (_server, base) = serve(data.path(), &["--no-worker"]);
+    let (_, job) = broken_survey_with_job(&client, &base);
+    let (worker, line) = start(data.path(), &["worker"]);
+    assert!(line.contains("works on jobs"), "{line}");
+    let job = follow(&client, &base, &job);
+    assert_eq!(job["state"], "failed", "{job}");
+    assert!(job["error"]["code"].is_string(), "{job}");
+    assert!(worker.terminate().success());
+}
+
+#[test]
+fn a_broken_reconstruction_fails_its_job() {
+    let data = tempfile::tempdir().unwrap();
+    let client = Client::new();
+    let (_program, base) = serve(data.path(), &[]);
+    let (_, job) = broken_survey_with_job(&client, &base);
+    let job = follow(&client, &base, &job);
+    assert_eq!((&job["state"], &job["attempt"]), (&json!("failed"), &json!(1)), "{job}");
+    assert!(job["error"]["code"].is_string() && job["error"]["message"].is_string(), "{job}");
+}
+
+#[test]
+fn mistakes_on_the_command_line_say_what_to_do() {
+    let run = |arguments: &[&str]| {
+        let output = Command::new(env!("CARGO_BIN_EXE_heliomap")).args(arguments).output().unwrap();
+        (output.status.success(), String::from_utf8(output.stderr).unwrap())
+    };
+    let (ok, text) = run(&["serve", "--listen", "nowhere"]);
+    assert!(!ok && text.contains("--listen"), "{text}");
+    let (ok, text) = run(&["serve", "--max-image-size", "12X"]);
+    assert!(!ok && text.contains("256M"), "{text}");
+    let (ok, text) = run(&["serve", "--data-dir", "/dev/null/x"]);
+    assert!(!ok && text.contains("--data-dir"), "{text}");
+}
+
+#[test]
+fn the_description_is_printed() {
+    let output = Command::new(env!("CARGO_BIN_EXE_heliomap")).arg("openapi").output().unwrap();
+    assert_eq!(String::from_utf8(output.stdout).unwrap(), include_str!("../../openapi.yaml"));
+}

@@ -1,0 +1,331 @@
+//! The suite. Times are given, so nothing waits.
+
+use heliomap::plant::{Layer, ModuleId, PlantId, Warning};
+use heliomap::store::{
+    Cancelled, Claim, Completed, Created, Digest, Ending, Enqueued, FeatureQuery, FileRecord, FileWritten, GeoBox,
+    Heartbeat, Job, JobRequest, JobState, NewFeature, NewLayer, NewModel, Page, Plant, Progress, Store, StoreError,
+    Survey, SurveyPath,
+};
+use jiff::Timestamp;
+use std::time::Duration;
+use uuid::Uuid;
+
+const LEASE: Duration = Duration::from_secs(30);
+const ALL: Page = Page { after: None, limit: 1000 };
+
+fn at(seconds: i64) -> Timestamp {
+    Timestamp::from_second(1_000_000 + seconds).unwrap()
+}
+
+async fn plant(store: &dyn Store, name: &str) -> Plant {
+    match store.create_plant(name, at(0)).await.unwrap() {
+        Created::New(plant) | Created::Existing(plant) => plant,
+    }
+}
+
+async fn survey(store: &dyn Store, plant: PlantId, name: &str) -> Survey {
+    match store.create_survey(plant, name, at(0)).await.unwrap() {
+        Created::New(survey) | Created::Existing(survey) => survey,
+    }
+}
+
+async fn enqueue(store: &dyn Store, survey: &Survey) -> Job {
+    let request = JobRequest { plant: survey.plant, survey: survey.id, options: "{}".to_owned(), max_attempts: 2 };
+    match store.enqueue_job(&request, at(0)).await.unwrap() {
+        Enqueued::New(job) => job,
+        Enqueued::Existing(job) => panic!("there is an unfinished job: {job:?}"),
+    }
+}
+
+async fn claim(store: &dyn Store, now: i64) -> Option<Claim> {
+    store.claim_job("worker", LEASE, at(now)).await.unwrap()
+}
+
+async fn state(store: &dyn Store, job: &Job) -> JobState {
+    store.job(job.plant, job.id).await.unwrap().unwrap().state
+}
+
+fn file(path: &str, content: &str) -> FileRecord {
+    FileRecord {
+        path: SurveyPath::parse(path).unwrap(),
+        size: content.len() as u64,
+        sha256: Digest::of(content.as_bytes()),
+        size_px: None,
+        stored: at(0),
+    }
+}
+
+/// A model of `columns` modules in a row along a parallel, a thousandth of a degree apart.
+fn model(plant: PlantId, version: u32, columns: u64) -> NewModel {
+    let features = (0..columns).map(|column| {
+        let lon = column as f64 * 1e-3;
+        NewFeature {
+            id: ModuleId::from_serial(plant, column).to_string(),
+            label: format!("{column}"),
+            json: format!("{{\"column\":{column},\"version\":{version}}}"),
+            extent: Some(GeoBox { min_lon: lon, min_lat: 50.0, max_lon: lon + 5e-4, max_lat: 50.001 }),
+        }
+    });
+    let layers = vec![
+        NewLayer { layer: Layer::Modules, properties: "{\"name\":\"x\"}".to_owned(), features: features.collect() },
+        NewLayer { layer: Layer::Lines, properties: "{}".to_owned(), features: Vec::new() },
+    ];
+    let warnings = vec![Warning::new("code", "message", ["a.jpg".to_owned()])];
+    NewModel { version, sha256: Digest::of(b"model"), size: 5, warnings, layers }
+}
+
+pub async fn plants_and_surveys(store: &dyn Store) {
+    store.ping().await.unwrap();
+    let a = plant(store, "A").await;
+    let b = plant(store, "B").await;
+    assert!(matches!(store.create_plant("A", at(9)).await.unwrap(), Created::Existing(found) if found.id == a.id));
+    assert_eq!(store.plant(b.id).await.unwrap().unwrap().name, "B");
+    assert!(store.plant(PlantId(Uuid::nil())).await.unwrap().is_none());
+    let names = async |page| store.plants(page).await.unwrap().into_iter().map(|p| p.name).collect::<Vec<_>>();
+    assert_eq!(names(Page { after: None, limit: 1 }).await, ["A"]);
+    assert_eq!(names(Page { after: Some(a.seq), limit: 9 }).await, ["B"]);
+
+    let june = survey(store, a.id, "June").await;
+    let july = survey(store, a.id, "July").await;
+    assert_ne!(survey(store, b.id, "June").await.id, june.id);
+    assert_eq!(survey(store, a.id, "June").await.id, june.id);
+    assert!(store.survey(b.id, july.id).await.unwrap().is_none());
+    assert_eq!(store.surveys(a.id, ALL).await.unwrap().len(), 2);
+    let nobody = store.create_survey(PlantId(Uuid::nil()), "June", at(0)).await;
+    assert!(matches!(nobody, Err(StoreError::Gone { what: "plant" })));
+}
+
+pub async fn files_all_or_none(store: &dyn Store) {
+    let survey = survey(store, plant(store, "A").await.id, "June").await;
+    let (a, b) = (file("images/a.jpg", "a"), file("reconstruction.json", "b"));
+    let written = store.put_files(survey.id, &[a.clone(), b.clone()]).await.unwrap();
+    assert_eq!(written, [FileWritten::Created, FileWritten::Created]);
+    let mut changed = file("images/a.jpg", "other");
+    changed.size_px = Some([4, 3]);
+    let written = store.put_files(survey.id, &[changed, b]).await.unwrap();
+    assert_eq!(written, [FileWritten::Replaced, FileWritten::Unchanged]);
+    let files = store.files(survey.id).await.unwrap();
+    assert_eq!((files.len(), files[0].size, files[0].size_px), (2, 5, Some([4, 3])));
+    assert_eq!(files[0].sha256, Digest::of(b"other"));
+    let nobody = store.put_files(heliomap::store::SurveyId(Uuid::nil()), &[a]).await;
+    assert!(matches!(nobody, Err(StoreError::Gone { what: "survey" })));
+}
+
+pub async fn one_unfinished_job_per_survey(store: &dyn Store) {
+    let survey = survey(store, plant(store, "A").await.id, "June").await;
+    let job = enqueue(store, &survey).await;
+    let request = JobRequest { plant: survey.plant, survey: survey.id, options: "[]".to_owned(), max_attempts: 2 };
+    let again = store.enqueue_job(&request, at(1)).await.unwrap();
+    assert!(matches!(again, Enqueued::Existing(found) if found.id == job.id && found.options == "{}"));
+    let claim = claim(store, 0).await.unwrap();
+    let again = store.enqueue_job(&request, at(1)).await.unwrap();
+    assert!(matches!(again, Enqueued::Existing(found) if found.state == JobState::Running));
+    let failed = Ending::Failed { code: "code".to_owned(), message: "message".to_owned() };
+    assert!(store.end_job(&claim, &failed, at(2)).await.unwrap());
+    assert!(matches!(store.enqueue_job(&request, at(3)).await.unwrap(), Enqueued::New(new) if new.id != job.id));
+    let jobs = store.jobs(survey.plant, None, ALL).await.unwrap();
+    assert_eq!((jobs.len(), jobs[1].id), (2, job.id));
+    assert_eq!(jobs[1].error, Some(("code".to_owned(), "message".to_owned())));
+    assert_eq!(
+        store.jobs(survey.plant, Some(survey.id), Page { after: Some(jobs[0].seq), limit: 9 }).await.unwrap().len(),
+        1
+    );
+}
+
+pub async fn jobs_of_one_plant_run_one_after_the_other(store: &dyn Store) {
+    let a = plant(store, "A").await.id;
+    let june = enqueue(store, &survey(store, a, "June").await).await;
+    let july = enqueue(store, &survey(store, a, "July").await).await;
+    let other = enqueue(store, &survey(store, plant(store, "B").await.id, "June").await).await;
+    let first = claim(store, 0).await.unwrap();
+    assert_eq!(first.job.id, june.id);
+    assert_eq!(claim(store, 0).await.unwrap().job.id, other.id);
+    assert!(claim(store, 0).await.is_none());
+    assert!(store.end_job(&first, &Ending::Cancelled, at(1)).await.unwrap());
+    assert_eq!(claim(store, 1).await.unwrap().job.id, july.id);
+}
+
+pub async fn an_abandoned_job_is_taken_up_and_its_first_worker_is_fenced_out(store: &dyn Store) {
+    let survey = survey(store, plant(store, "A").await.id, "June").await;
+    enqueue(store, &survey).await;
+    let first = claim(store, 0).await.unwrap();
+    let progress = Progress { stage: "detect".to_owned(), done: 3, total: 9 };
+    assert_eq!(store.heartbeat(&first, Some(progress.clone()), LEASE, at(20)).await.unwrap(), Heartbeat::Continue);
+    assert_eq!(store.job(survey.plant, first.job.id).await.unwrap().unwrap().progress, Some(progress));
+    assert!(claim(store, 49).await.is_none());
+    let second = claim(store, 51).await.unwrap();
+    assert_eq!((second.job.id, second.job.attempt, second.job.progress.clone()), (first.job.id, 2, None));
+    assert_eq!(store.heartbeat(&first, None, LEASE, at(52)).await.unwrap(), Heartbeat::Lost);
+    assert!(matches!(store.complete_job(&first, &model(survey.plant, 1, 1), at(52)).await.unwrap(), Completed::Fenced));
+    assert!(!store.end_job(&first, &Ending::Cancelled, at(52)).await.unwrap());
+    assert!(store.model(survey.plant, None).await.unwrap().is_none());
+    let done = store.complete_job(&second, &model(survey.plant, 1, 1), at(53)).await.unwrap();
+    assert!(matches!(done, Completed::Done(_)));
+}
+
+pub async fn a_job_that_kills_its_workers_ends(store: &dyn Store) {
+    let survey = survey(store, plant(store, "A").await.id, "June").await;
+    let job = enqueue(store, &survey).await;
+    assert!(claim(store, 0).await.is_some());
+    assert!(claim(store, 100).await.is_some());
+    assert!(claim(store, 200).await.is_none());
+    let job = store.job(job.plant, job.id).await.unwrap().unwrap();
+    assert_eq!((job.state, job.error.unwrap().0.as_str()), (JobState::Failed, "worker_lost"));
+}
+
+pub async fn a_released_job_has_its_attempt_back(store: &dyn Store) {
+    let survey = survey(store, plant(store, "A").await.id, "June").await;
+    enqueue(store, &survey).await;
+    for now in 0..5 {
+        let claim = claim(store, now).await.unwrap();
+        assert_eq!(claim.job.attempt, 1);
+        assert!(store.end_job(&claim, &Ending::Released, at(now)).await.unwrap());
+        assert!(!store.end_job(&claim, &Ending::Released, at(now)).await.unwrap());
+    }
+}
+
+pub async fn retry_waits_and_ends(store: &dyn Store) {
+    let survey = survey(store, plant(store, "A").await.id, "June").await;
+    let job = enqueue(store, &survey).await;
+    let retry = |seconds| Ending::Retry { code: "environment".to_owned(), message: "m".to_owned(), at: at(seconds) };
+    let first = claim(store, 0).await.unwrap();
+    assert!(store.end_job(&first, &retry(10), at(1)).await.unwrap());
+    assert_eq!(state(store, &job).await, JobState::Queued);
+    assert!(claim(store, 9).await.is_none());
+    let second = claim(store, 10).await.unwrap();
+    assert!(store.end_job(&second, &retry(20), at(11)).await.unwrap());
+    assert_eq!(state(store, &job).await, JobState::Failed);
+    assert!(claim(store, 30).await.is_none());
+}
+
+pub async fn cancel(store: &dyn Store) {
+    let survey = survey(store, plant(store, "A").await.id, "June").await;
+    let queued = enqueue(store, &survey).await;
+    let outcome = store.cancel_job(queued.plant, queued.id, at(1)).await.unwrap();
+    assert!(
+        matches!(outcome, Some(Cancelled::Accepted(job)) if job.state == JobState::Cancelled && job.finished.is_some())
+    );
+    assert!(claim(store, 2).await.is_none());
+
+    let running = enqueue(store, &survey).await;
+    let first = claim(store, 2).await.unwrap();
+    let outcome = store.cancel_job(running.plant, running.id, at(3)).await.unwrap();
+    assert!(
+        matches!(outcome, Some(Cancelled::Accepted(job)) if job.state == JobState::Running && job.cancel_requested)
+    );
+    assert_eq!(store.heartbeat(&first, None, LEASE, at(4)).await.unwrap(), Heartbeat::Cancel);
+    assert!(store.end_job(&first, &Ending::Cancelled, at(5)).await.unwrap());
+    let outcome = store.cancel_job(running.plant, running.id, at(6)).await.unwrap();
+    assert!(matches!(outcome, Some(Cancelled::TooLate(job)) if job.state == JobState::Cancelled));
+    assert!(store.cancel_job(PlantId(Uuid::nil()), running.id, at(6)).await.unwrap().is_none());
+
+    // A cancelled job whose worker fell silent is not taken up again.
+    let silent = enqueue(store, &survey).await;
+    claim(store, 7).await.unwrap();
+    store.cancel_job(silent.plant, silent.id, at(8)).await.unwrap();
+    assert!(claim(store, 100).await.is_none());
+    assert_eq!(state(store, &silent).await, JobState::Cancelled);
+}
+
+pub async fn models_and_features(store: &dyn Store) {
+    let survey = survey(store, plant(store, "A").await.id, "June").await;
+    for version in 1..=2 {
+        enqueue(store, &survey).await;
+        let claim = claim(store, 0).await.unwrap();
+        let new = model(survey.plant, version, 3 - u64::from(version - 1));
+        let Completed::Done(stored) = store.complete_job(&claim, &new, at(1)).await.unwrap() else {
+            panic!("the claim holds");
+        };
+        assert_eq!((stored.version, stored.survey, stored.size), (version, survey.id, 5));
+        let job = store.job(survey.plant, claim.job.id).await.unwrap().unwrap();
+        assert_eq!((job.state, job.model_version, job.warnings), (JobState::Succeeded, Some(version), new.warnings));
+    }
+    let versions: Vec<u32> = store.models(survey.plant, ALL).await.unwrap().iter().map(|m| m.version).collect();
+    assert_eq!(versions, [2, 1]);
+    let newest = store.model(survey.plant, None).await.unwrap().unwrap();
+    let first = store.model(survey.plant, Some(1)).await.unwrap().unwrap();
+    assert_eq!((newest.version, newest.sha256), (2, Digest::of(b"model")));
+    assert!(store.model(survey.plant, Some(3)).await.unwrap().is_none());
+
+    let layer = store.layer(&first, Layer::Modules).await.unwrap().unwrap();
+    assert_eq!((layer.features, layer.properties.as_str()), (3, "{\"name\":\"x\"}"));
+    let query = FeatureQuery { after: None, limit: 2, within: None };
+    let part = store.features(&layer, query).await.unwrap();
+    let rest = store.features(&layer, FeatureQuery { after: Some(part[1].seq), ..query }).await.unwrap();
+    let json: Vec<&str> = part.iter().chain(&rest).map(|feature| feature.json.as_str()).collect();
+    assert_eq!(json, [0, 1, 2].map(|column| format!("{{\"column\":{column},\"version\":1}}")));
+    let empty = store.layer(&first, Layer::Lines).await.unwrap().unwrap();
+    assert_eq!((empty.features, empty.extent), (0, None));
+    assert!(store.layer(&first, Layer::Benches).await.unwrap().is_none());
+
+    let id = |serial| ModuleId::from_serial(survey.plant, serial);
+    assert_eq!(store.module(&newest, id(0)).await.unwrap().unwrap(), "{\"column\":0,\"version\":2}");
+    assert_eq!(store.module(&newest, id(2)).await.unwrap(), None);
+    assert_eq!(store.module_last_seen(survey.plant, id(2)).await.unwrap(), Some(1));
+    assert_eq!(store.module_last_seen(survey.plant, id(9)).await.unwrap(), None);
+}
+
+pub async fn two_models_of_one_version_are_not_written(store: &dyn Store) {
+    let survey = survey(store, plant(store, "A").await.id, "June").await;
+    enqueue(store, &survey).await;
+    let first = claim(store, 0).await.unwrap();
+    store.complete_job(&first, &model(survey.plant, 1, 1), at(1)).await.unwrap();
+    let job = enqueue(store, &survey).await;
+    let second = claim(store, 2).await.unwrap();
+    let outdated = store.complete_job(&second, &model(survey.plant, 1, 9), at(3)).await.unwrap();
+    assert!(matches!(outdated, Completed::Outdated));
+    assert_eq!(state(store, &job).await, JobState::Running);
+    let kept = store.model(survey.plant, None).await.unwrap().unwrap();
+    assert_eq!(store.layer(&kept, Layer::Modules).await.unwrap().unwrap().features, 1);
+}
+
+pub async fn a_deleted_plant_takes_everything_with_it(store: &dyn Store) {
+    let survey = survey(store, plant(store, "A").await.id, "June").await;
+    store.put_files(survey.id, &[file("images/a.jpg", "a")]).await.unwrap();
+    enqueue(store, &survey).await;
+    let first = claim(store, 0).await.unwrap();
+    store.complete_job(&first, &model(survey.plant, 1, 3), at(1)).await.unwrap();
+    let stored = store.model(survey.plant, None).await.unwrap().unwrap();
+    enqueue(store, &survey).await;
+    let running = claim(store, 2).await.unwrap();
+    assert!(store.delete_plant(survey.plant).await.unwrap());
+    assert!(!store.delete_plant(survey.plant).await.unwrap());
+    assert_eq!(store.heartbeat(&running, None, LEASE, at(3)).await.unwrap(), Heartbeat::Lost);
+    assert!(store.files(survey.id).await.unwrap().is_empty());
+    assert!(store.model(survey.plant, None).await.unwrap().is_none());
+    assert!(store.layer(&stored, Layer::Modules).await.unwrap().is_none());
+    assert!(store.module(&stored, ModuleId::from_serial(survey.plant, 0)).await.unwrap().is_none());
+}
+
+/// Small boxes are looked up by place, large ones by order: both find the same, in order, part by part.
+pub async fn boxes_find_what_touches_them(store: &dyn Store) {
+    let survey = survey(store, plant(store, "A").await.id, "June").await;
+    enqueue(store, &survey).await;
+    let first = claim(store, 0).await.unwrap();
+    store.complete_job(&first, &model(survey.plant, 1, 200), at(1)).await.unwrap();
+    let stored = store.model(survey.plant, None).await.unwrap().unwrap();
+    let layer = store.layer(&stored, Layer::Modules).await.unwrap().unwrap();
+    for (from, to) in [(10, 12), (0, 199), (50, 150), (7, 7)] {
+        for (south, north) in [(49.0, 51.0), (50.0009, 50.002), (49.0, 50.0)] {
+            let within = GeoBox {
+                min_lon: from as f64 * 1e-3 + 1e-4,
+                max_lon: to as f64 * 1e-3 + 1e-4,
+                min_lat: south,
+                max_lat: north,
+            };
+            let mut query = FeatureQuery { after: None, limit: 7, within: Some(within) };
+            let mut columns = Vec::new();
+            loop {
+                let part = store.features(&layer, query).await.unwrap();
+                let Some(last) = part.last() else { break };
+                query.after = Some(last.seq);
+                columns.extend(part.iter().map(|feature| feature.json.clone()));
+            }
+            let expected: Vec<String> = (from..=to).map(|c| format!("{{\"column\":{c},\"version\":1}}")).collect();
+            assert_eq!(columns, expected, "{within:?}");
+        }
+    }
+    let elsewhere = GeoBox { min_lon: 0.0, min_lat: 50.002, max_lon: 1.0, max_lat: 51.0 };
+    let query = FeatureQuery { after: None, limit: 9, within: Some(elsewhere) };
+    assert!(store.features(&layer, query).await.unwrap().is_empty());
+}
