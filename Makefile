@@ -1,0 +1,61 @@
+# heliomap. `make demo` maps the example plant and shows it; `make test` runs all tests; `make help` lists the rest.
+
+SHELL := bash
+.SHELLFLAGS := -euo pipefail -c
+.DEFAULT_GOAL := help
+
+PYTHON ?= python3
+NPM ?= npm
+CARGO ?= cargo
+
+# ONNX Runtime comes from its Python wheel: a shared library of 29 MB, and no build.
+ONNXRUNTIME_VERSION := 1.31.1
+ORT_LIBRARY := .ort/libonnxruntime.so
+export ORT_DYLIB_PATH ?= $(abspath $(ORT_LIBRARY))
+
+# Where the data sets lie that are too large for the repository; tests that need one say so when they skip.
+HELIOMAP_DATA ?= $(wildcard ../shared/data)
+export HELIOMAP_DATA
+
+.PHONY: help setup web demo test lint unit bench openapi clean
+
+help: ## List the targets
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+
+setup: $(ORT_LIBRARY) web/dist/index.html ## Install what is missing: ONNX Runtime, and the web page's build
+
+$(ORT_LIBRARY):
+	@echo "fetching ONNX Runtime $(ONNXRUNTIME_VERSION)"
+	@rm -rf .ort && mkdir -p .ort/wheel
+	@$(PYTHON) -m pip download --quiet --disable-pip-version-check --no-deps --only-binary=:all: \
+	  --dest .ort/wheel onnxruntime==$(ONNXRUNTIME_VERSION)
+	@$(PYTHON) -m zipfile --extract .ort/wheel/*.whl .ort/wheel/unpacked
+	@cp .ort/wheel/unpacked/onnxruntime/capi/libonnxruntime.so.* $(ORT_LIBRARY)
+	@rm -rf .ort/wheel
+
+web: web/dist/index.html ## Build the web page
+
+web/dist/index.html: $(wildcard web/src/* web/src/*/* web/*.html web/package-lock.json web/vite.config.ts)
+	@cd web && $(NPM) ci --no-audit --no-fund --loglevel=error && $(NPM) run build --silent
+
+demo: setup ## Map the example plant through the HTTP service and check it (KEEP=1 leaves the service running)
+	$(CARGO) build --release --locked
+	$(PYTHON) examples/demo.py --binary target/release/heliomap $(if $(KEEP),--keep)
+
+test: lint unit ## Run all tests
+
+lint: setup ## Formatting and lints, warnings are errors
+	$(CARGO) fmt --check
+	$(CARGO) clippy --locked --all-targets -- --deny warnings
+
+unit: setup ## Tests alone
+	$(CARGO) test --locked
+
+bench: setup ## Benchmarks of layout, locate, fusion and refinement
+	$(CARGO) bench --locked
+
+openapi: ## Write openapi.yaml anew from the code
+	$(CARGO) run --locked --quiet -- openapi > openapi.yaml.new && mv openapi.yaml.new openapi.yaml
+
+clean: ## Remove everything that was built or fetched
+	rm -rf target .ort web/dist web/node_modules
