@@ -233,8 +233,7 @@ fn views_disagree_by_as_much_as_stated() {
     let errors =
         Errors { corner_jitter_px: 0.0, center_jitter_px: 0.0, size_jitter: 0.0, ..Errors::paper().without_cloud() };
     let simulation = simulate(&spec, &Flight::paper_pp1(), &errors, 11);
-    // Every detection back to the height at which its module is in the warped world: with these small tilts, the mean height of the
-    // module's own corners, found from the estimated world's scale about the plant.
+    // Every detection as far along its estimated ray as its module truly is: where this view alone would put it.
     let mut places: BTreeMap<usize, Vec<Vector2<f64>>> = BTreeMap::new();
     for (index, shot) in simulation.reconstruction.shots.iter().enumerate() {
         let pose = &simulation.true_shots[index].pose;
@@ -421,6 +420,33 @@ fn every_module_of_every_kind_is_seen_from_any_flight() {
             let few = sightings.iter().filter(|count| **count < 2).count();
             assert!(few * 100 < sightings.len(), "{kind:?} {seed}: {few} of {} seen less than twice", sightings.len());
             assert!(sightings.iter().all(|count| *count > 0), "{kind:?} {seed}");
+        }
+    }
+}
+
+#[test]
+fn a_bent_and_noisy_mapping_is_still_paired_right() {
+    for kind in LayoutKind::ALL {
+        for seed in 0..8 {
+            let mut rng = rng(seed);
+            let truth = PlantSpec::random(kind, &mut rng).build();
+            let scale = 1.0 + 0.01 * noise::signed(&mut rng);
+            let shift = noise::horizontal(&mut rng, 1.0);
+            let shifts: Vec<_> = truth.benches.iter().map(|_| noise::horizontal(&mut rng, 0.4)).collect();
+            let mut found = perfect(&truth, |p| p * scale + shift);
+            for (found, module) in found.iter_mut().zip(&truth.modules) {
+                found.center_enu_m += shifts[module.bench as usize] + noise::horizontal(&mut rng, 0.1);
+            }
+            let report = structure_report(&truth, &found);
+            assert!(report.exact, "{kind:?} {seed}: {:?} {:?}", report.missing, report.wrong_structure);
+            // A whole bench less is that bench less.
+            let bench = &truth.benches[truth.benches.len() / 2];
+            if truth.benches.len() > 5 {
+                found.drain(bench.modules.clone());
+                let report = structure_report(&truth, &found);
+                assert_eq!(report.missing, bench.modules.clone().collect::<Vec<_>>(), "{kind:?} {seed}");
+                assert!(report.false_modules.is_empty() && report.wrong_structure.is_empty());
+            }
         }
     }
 }
