@@ -95,10 +95,10 @@ fn disturbed(shot: &Shot, ground_z_m: f64, largest_m: f64, rng: &mut StdRng) -> 
         f64::from(shot.camera.width_px).hypot(f64::from(shot.camera.height_px)) / 2.0 / shot.camera.focal_px()
             * distance_m;
     // Shares of the allowance: the view shifted, turned in its plane, tilted about its target, nearer or farther.
-    let shift = horizontal(rng, 0.6 * largest_m);
+    let shift = horizontal(rng, 0.7 * largest_m);
     let spin = signed(rng) * 0.2 * largest_m / half_diagonal_m;
-    let tilt = horizontal(rng, 0.1 * largest_m) / half_diagonal_m;
-    let nearer_m = signed(rng) * 0.1 * largest_m * distance_m / half_diagonal_m;
+    let tilt = horizontal(rng, 0.05 * largest_m) / half_diagonal_m;
+    let nearer_m = signed(rng) * 0.05 * largest_m * distance_m / half_diagonal_m;
     let turn = Rotation3::new(tilt + Vector3::z() * spin);
     let moved = target + shift + turn * (center - target) + Vector3::z() * nearer_m;
     Shot {
