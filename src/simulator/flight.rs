@@ -64,9 +64,10 @@ impl Flight {
         }
     }
 
-    /// About as many photos as the paper took of its first plant (Table 1), with its camera at half resolution (4).
+    /// About as many photos as the paper took of its first plant (Table 1), with its camera at half resolution (4),
+    /// from so high that every module is in two photos at least.
     pub fn paper_pp1() -> Self {
-        Self { altitude_m: 108.0, forward_overlap: 0.5, side_overlap: 0.5, ..Self::plain() }
+        Self { altitude_m: 115.0, forward_overlap: 0.5, side_overlap: 0.5, ..Self::plain() }
     }
 
     /// About as many photos as the paper took of its second plant, with its camera (Table 1, 4).
@@ -82,7 +83,7 @@ impl Flight {
 
     /// For plants of any size, [`super::PlantSpec::sized`]: about one photo per 250 modules.
     pub fn sized() -> Self {
-        Self { altitude_m: 70.0, forward_overlap: 0.6, side_overlap: 0.55, overhang: 0.5, ..Self::plain() }
+        Self { altitude_m: 76.0, forward_overlap: 0.62, side_overlap: 0.6, overhang: 0.5, ..Self::plain() }
     }
 
     /// The same flight with photos so much closer that about `factor` times as many are taken.

@@ -337,8 +337,8 @@ impl PlantSpec {
         one_block("random_missing_modules", gentle(rng), heading_rad, lines)
     }
 
-    /// Single-axis trackers: rows from north to south, one module across, each parted by its motor's gap. All stand at the
-    /// same angle but for a degree.
+    /// Single-axis trackers: rows from north to south, one module across, each parted by its motor's gap. All stand at
+    /// the same angle but for a degree.
     pub fn random_trackers(rng: &mut StdRng) -> Self {
         let module_m = [rng.random_range(1.0..1.15), rng.random_range(1.9..2.2)];
         let tilt_rad = 0.4 * signed(rng);

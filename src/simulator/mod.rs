@@ -10,8 +10,8 @@
 //! assert_eq!(simulation.detections.len(), simulation.reconstruction.shots.len());
 //! ```
 //!
-//! - [`PlantSpec`] is the plant on paper: blocks of lines of benches over a terrain; [`PlantSpec::build`] puts it on the ground
-//!   as a [`PlantTruth`]. Constructors draw plants of many kinds at random.
+//! - [`PlantSpec`] is the plant on paper: blocks of lines of benches over a terrain; [`PlantSpec::build`] puts it on
+//!   the ground as a [`PlantTruth`]. Constructors draw plants of many kinds at random ([`LayoutKind`]).
 //! - [`Flight`] says from where photos are taken.
 //! - [`Errors`] says what goes wrong in detection and reconstruction.
 //! - [`simulate`] does it all from one seed; the same seed gives the same result on any number of threads.
@@ -19,14 +19,14 @@
 //!
 //! # Frames and conventions
 //!
-//! The truth is in a local east-north-up frame, metres. Lines head east, or south for rows from north to south; row 0 of
-//! a bench is on the left of the heading (north, or east), column 0 at the start of the bench (west, or north). A
-//! single-axis tracker whose motor parts its row in two is two benches with a narrow gap: from the air that gap is the same
-//! as any other. A line goes on through a road. A bench keeps its columns where modules are missing.
+//! The truth is in a local east-north-up frame, metres. Lines head east, or south for rows from north to south; row 0
+//! of a bench is on the left of the heading (north, or east), column 0 at the start of the bench (west, or north). A
+//! single-axis tracker whose motor parts its row in two is two benches with a narrow gap: from the air that gap is the
+//! same as any other. A line goes on through a road. A bench keeps its columns where modules are missing.
 //!
-//! The reconstruction has a frame of its own: shifted, turned a little, wrong in scale by a fraction of a percent, and bent by a
-//! smooth drift. Its poses disagree with each other on top of that. Its cloud is made of depth maps: each point is where
-//! the view nearest to it puts it, with noise along the viewing ray.
+//! The reconstruction has a frame of its own: shifted, turned a little, wrong in scale by a fraction of a percent, and
+//! bent by a smooth drift. Its poses disagree with each other on top of that. Its cloud is made of depth maps: each
+//! point is where the view nearest to it puts it, with noise along the viewing ray.
 
 mod flight;
 mod layouts;
@@ -86,10 +86,11 @@ pub struct Errors {
     pub drift_m: f64,
     /// Shortest wavelength of the drift, metres.
     pub drift_wavelength_m: f64,
-    /// By how much two views may disagree on where a module is, seen from above, metres (drift within a view adds a little).
+    /// By how much two views may disagree on where a module is, seen from above, metres (drift within a view adds a
+    /// little).
     pub view_disagreement_m: f64,
-    /// Standard deviation of the dense cloud's points along the viewing ray, metres. Half of the variance is common to all points
-    /// of a module.
+    /// Standard deviation of the dense cloud's points along the viewing ray, metres. Half of the variance is common to
+    /// all points of a module.
     pub cloud_noise_m: f64,
     /// Dense points on each square metre of module or open ground; with 0 there is no dense cloud.
     pub cloud_points_per_m2: f64,
@@ -100,7 +101,8 @@ pub struct Errors {
 }
 
 impl Errors {
-    /// Errors as the paper reports them (4.2, 4.3): 98.5 % of modules and 93 % of gaps found, views that disagree by up to 0.6 m.
+    /// Errors as the paper reports them (4.2, 4.3): 98.5 % of modules and 93 % of gaps found, views that disagree by up
+    /// to 0.6 m.
     pub fn paper() -> Self {
         Self {
             detection_rate: 0.985,

@@ -28,12 +28,6 @@ pub(super) fn normal_pair(rng: &mut StdRng) -> (f64, f64) {
     (radius * cos, radius * sin)
 }
 
-/// A vector of three independent normal draws.
-pub(super) fn normal_vector(rng: &mut StdRng) -> Vector3<f64> {
-    let (x, y) = normal_pair(rng);
-    Vector3::new(x, y, normal(rng))
-}
-
 /// A draw from the uniform distribution on [-1, 1].
 pub(super) fn signed(rng: &mut StdRng) -> f64 {
     rng.random_range(-1.0..=1.0)

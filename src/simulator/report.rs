@@ -2,6 +2,7 @@
 
 use super::plant::{ModuleGrid, PlantTruth};
 use nalgebra::{Matrix2, Vector2, Vector3};
+use rstar::{RTree, primitives::GeomWithData};
 use std::collections::BTreeMap;
 
 /// One module as a mapping found it.
@@ -32,11 +33,11 @@ pub struct StructureReport {
     pub pairs: Vec<Option<usize>>,
 }
 
-/// Compares what was found with the truth. Modules are paired by place, seen from above: a common shift of up to a metre,
-/// a scale error of up to a percent, a small turn, and shifts of single benches of up to 0.7 m do not matter; then the middle of a
-/// found module must lie on the face of its true one. The structure agrees where one naming of lines and benches, and
-/// for the whole plant one way of counting rows and one of counting numbers (from either end, from any first number),
-/// turns the found places into the true ones.
+/// Compares what was found with the truth. Modules are paired by place, seen from above: a common shift of up to a
+/// metre, a scale error of up to a percent, a small turn, and shifts of single benches of up to 0.4 m do not matter;
+/// then the middle of a found module must lie on the face of its true one. The structure agrees where one naming of
+/// lines and benches, and for the whole plant one way of counting rows and one of counting numbers (from either end,
+/// from any first number), turns the found places into the true ones.
 pub fn structure_report(truth: &PlantTruth, found: &[FoundModule]) -> StructureReport {
     let mut report = StructureReport::default();
     if truth.modules.is_empty() || found.is_empty() {
@@ -48,13 +49,12 @@ pub fn structure_report(truth: &PlantTruth, found: &[FoundModule]) -> StructureR
     }
     let grid = ModuleGrid::new(truth, 3.0);
     let places: Vec<Vector2<f64>> = found.iter().map(|module| module.center_enu_m.xy()).collect();
-    let alignment = Planar::align(truth, &grid, &places);
-    let places: Vec<Vector2<f64>> = places.iter().map(|place| alignment.apply(*place)).collect();
-
     let mut benches: BTreeMap<(&str, &str), Vec<usize>> = BTreeMap::new();
     for (index, module) in found.iter().enumerate() {
         benches.entry((&module.line, &module.bench)).or_default().push(index);
     }
+    let alignment = Planar::align(truth, &grid, &places, benches.values());
+    let places: Vec<Vector2<f64>> = places.iter().map(|place| alignment.apply(*place)).collect();
     report.pairs = pairs(truth, &grid, &places, benches.values());
     let mut taken = vec![false; truth.modules.len()];
     for (index, pair) in report.pairs.iter().enumerate() {
@@ -98,7 +98,8 @@ fn pairs<'a>(
     pairs
 }
 
-/// The shift of at most [`LARGEST_SHIFT_M`] that puts most members of a found bench on true modules; none where none is needed.
+/// The shift of at most 0.7 m that puts most members of a found bench on modules of one true bench; none where none is
+/// needed.
 fn bench_shift(truth: &PlantTruth, grid: &ModuleGrid, places: &[Vector2<f64>], members: &[usize]) -> Vector2<f64> {
     const LARGEST_SHIFT_M: f64 = 0.7;
     let settle = |start: Vector2<f64>| {
@@ -122,9 +123,11 @@ fn bench_shift(truth: &PlantTruth, grid: &ModuleGrid, places: &[Vector2<f64>], m
             }
             shift = next;
         }
+        // Beside a narrow gap a bench shifted by a column has all modules on faces, but not on those of one bench.
         modules.sort_unstable();
         modules.dedup();
-        (modules.len(), shift)
+        let parts = modules.chunk_by(|a, b| truth.modules[*a].bench == truth.modules[*b].bench);
+        (parts.map(<[usize]>::len).max().unwrap_or(0), shift)
     };
     let mut best = settle(Vector2::zeros());
     if best.0 < members.len() {
@@ -172,18 +175,27 @@ impl Planar {
         Some(Self { turn, shift: to_mean - turn * from_mean })
     }
 
-    /// Found places -> true places. From several starts (as they are, moments equalised, shifted about) places and the
-    /// modules under them are paired and fitted in turn; the start that ends with most pairs wins.
-    fn align(truth: &PlantTruth, grid: &ModuleGrid, places: &[Vector2<f64>]) -> Self {
+    /// Found places -> true places. From several starts (as they are, moments equalised, benches matched, shifted
+    /// about) places and the modules under them are paired and fitted in turn; the start that ends best wins. `benches`
+    /// are the found ones.
+    fn align<'a>(
+        truth: &PlantTruth,
+        grid: &ModuleGrid,
+        places: &[Vector2<f64>],
+        benches: impl Iterator<Item = &'a Vec<usize>> + Clone,
+    ) -> Self {
+        let by_benches = Self::by_benches(truth, places, benches.clone());
         let step = places.len().div_ceil(8000);
-        let sample: Vec<Vector2<f64>> = places.iter().step_by(step).copied().collect();
+        let members = (0..).zip(benches).flat_map(|(bench, members)| members.iter().map(move |&index| (bench, index)));
+        let sample: Vec<(u32, Vector2<f64>)> =
+            members.step_by(step).map(|(bench, index)| (bench, places[index])).collect();
         let identity = Self { turn: Matrix2::identity(), shift: Vector2::zeros() };
         let best = |starts: Vec<Self>| {
             let ends = starts.into_iter().map(|start| start.improved(truth, grid, &sample));
             ends.max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or((0.0, identity))
         };
-        let mut end = best(vec![identity, Self::by_moments(truth, places)]);
-        if end.0 < 0.97 * sample.len() as f64 {
+        let mut end = best(vec![identity, Self::by_moments(truth, places), by_benches]);
+        if end.0 < sample.len() as f64 - 1.0 {
             let shifted =
                 |k: i32| Self { shift: Vector2::new(f64::from(k % 5 - 2), f64::from(k / 5 - 2)) * 0.5, ..identity };
             let other = best((0..25).map(shifted).collect());
@@ -192,6 +204,48 @@ impl Planar {
             }
         }
         end.1
+    }
+
+    /// Puts found benches on the true benches of as many modules next to them.
+    fn by_benches<'a>(
+        truth: &PlantTruth,
+        places: &[Vector2<f64>],
+        benches: impl Iterator<Item = &'a Vec<usize>>,
+    ) -> Self {
+        const REACH_M: f64 = 4.0;
+        let mean = |sum: Vector2<f64>, count: usize| sum / count as f64;
+        let middles = truth.benches.iter().enumerate().filter(|(_, bench)| !bench.modules.is_empty());
+        let middles = middles.map(|(index, bench)| {
+            let sum = truth.modules[bench.modules.clone()].iter().map(|module| module.center_enu_m.xy()).sum();
+            GeomWithData::new(<[f64; 2]>::from(mean(sum, bench.modules.len())), index)
+        });
+        let tree = RTree::bulk_load(middles.collect());
+        let found: Vec<(Vector2<f64>, usize)> = benches
+            .map(|members| (mean(members.iter().map(|&index| places[index]).sum(), members.len()), members.len()))
+            .collect();
+        let mut best = Self { turn: Matrix2::identity(), shift: Vector2::zeros() };
+        for round in 0..3 {
+            let reach_m = if round == 0 { REACH_M } else { 1.0 };
+            let pairs: Vec<(Vector2<f64>, Vector2<f64>)> = found
+                .iter()
+                .filter_map(|(middle, count)| {
+                    let place = best.apply(*middle);
+                    let (nearest, distance_2) = tree.nearest_neighbor_iter_with_distance_2(place.into()).next()?;
+                    let same = truth.benches[nearest.data].modules.len() == *count;
+                    (same && distance_2 < reach_m * reach_m).then(|| (*middle, Vector2::from(*nearest.geom())))
+                })
+                .collect();
+            if pairs.is_empty() {
+                break;
+            }
+            // A few benches tell a shift, not a scale.
+            let fit = if pairs.len() >= 5 { Self::fit(&pairs) } else { None };
+            best = fit.unwrap_or_else(|| {
+                let shift = pairs.iter().map(|(from, to)| to - from).sum::<Vector2<f64>>() / pairs.len() as f64;
+                Self { turn: Matrix2::identity(), shift }
+            });
+        }
+        best
     }
 
     /// Makes centroid and spread equal.
@@ -212,20 +266,29 @@ impl Planar {
         Self { turn: Matrix2::identity() * scale, shift: to - from * scale }
     }
 
-    /// Number of pairs, less their mean distance in half modules, and the transform after fitting.
-    fn improved(mut self, truth: &PlantTruth, grid: &ModuleGrid, sample: &[Vector2<f64>]) -> (f64, Self) {
+    /// The transform after fitting, and how good it is: the number of places on modules, counting of each found bench
+    /// those on one true bench, less their mean distance in half modules.
+    fn improved(mut self, truth: &PlantTruth, grid: &ModuleGrid, sample: &[(u32, Vector2<f64>)]) -> (f64, Self) {
         let mut score = 0.0;
         for _ in 0..12 {
             let mut pairs = Vec::with_capacity(sample.len());
+            let mut benches = Vec::with_capacity(sample.len());
             let mut distance = 0.0;
-            for place in sample {
+            for (bench, place) in sample {
                 let moved = self.apply(*place);
                 if let Some(module) = grid.at(truth, moved) {
-                    distance += truth.modules[module].place_on_face(moved).amax();
-                    pairs.push((*place, truth.modules[module].center_enu_m.xy()));
+                    let module = &truth.modules[module];
+                    distance += module.place_on_face(moved).amax();
+                    pairs.push((*place, module.center_enu_m.xy()));
+                    benches.push((*bench, module.bench));
                 }
             }
-            let now = pairs.len() as f64 - distance / pairs.len().max(1) as f64;
+            benches.sort_unstable();
+            let together: usize = benches
+                .chunk_by(|a, b| a.0 == b.0)
+                .map(|found| found.chunk_by(|a, b| a.1 == b.1).map(<[(u32, u32)]>::len).max().unwrap_or(0))
+                .sum();
+            let now = together as f64 - distance / pairs.len().max(1) as f64;
             if now <= score + 1e-9 {
                 break;
             }

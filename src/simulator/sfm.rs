@@ -3,9 +3,9 @@
 
 use super::Errors;
 use super::flight::pose_at;
-use super::noise::{horizontal, normal, normal_pair, normal_vector, signed, stream};
+use super::noise::{horizontal, normal, normal_pair, signed, stream};
 use super::observe::View;
-use super::plant::{ModuleGrid, PlantTruth};
+use super::plant::{ModuleGrid, PlantTruth, TruthModule};
 use crate::geometry::{PointCloud, Similarity};
 use crate::reconstruction::{Reconstruction, Shot};
 use nalgebra::{Rotation3, Vector2, Vector3};
@@ -94,11 +94,11 @@ fn disturbed(shot: &Shot, ground_z_m: f64, largest_m: f64, rng: &mut StdRng) -> 
     let half_diagonal_m =
         f64::from(shot.camera.width_px).hypot(f64::from(shot.camera.height_px)) / 2.0 / shot.camera.focal_px()
             * distance_m;
-    // Shares of the allowance: all of the view shifted, turned in its plane, tilted about its target, nearer or farther.
-    let shift = horizontal(rng, 0.6 * largest_m);
+    // Shares of the allowance: the view shifted, turned in its plane, tilted about its target, nearer or farther.
+    let shift = horizontal(rng, 0.7 * largest_m);
     let spin = signed(rng) * 0.2 * largest_m / half_diagonal_m;
-    let tilt = horizontal(rng, 0.1 * largest_m) / half_diagonal_m;
-    let nearer_m = signed(rng) * 0.1 * largest_m * distance_m / half_diagonal_m;
+    let tilt = horizontal(rng, 0.05 * largest_m) / half_diagonal_m;
+    let nearer_m = signed(rng) * 0.05 * largest_m * distance_m / half_diagonal_m;
     let turn = Rotation3::new(tilt + Vector3::z() * spin);
     let moved = target + shift + turn * (center - target) + Vector3::z() * nearer_m;
     Shot {
@@ -203,33 +203,42 @@ impl World<'_> {
     }
 
     fn cloud(&self, nearest: &Nearest, seed: u64) -> PointCloud {
-        let chunk = 2048;
-        let faces = (0..self.truth.modules.len().div_ceil(chunk)).into_par_iter().map(|index| {
+        /// Modules in one part of the work.
+        const CHUNK: usize = 512;
+        /// Parts worked on before they are joined to the cloud, so that it is not in memory twice.
+        const BATCH: usize = 512;
+        let modules = self.truth.modules.len();
+        let chunks = modules.div_ceil(CHUNK);
+        let part = |index: usize| {
             let mut part = PointCloud::default();
-            let mut rng = stream(seed, 6, index);
-            let end = ((index + 1) * chunk).min(self.truth.modules.len());
-            for module in index * chunk..end {
-                self.face(module, nearest, &mut part, &mut rng);
+            if index < chunks {
+                let mut rng = stream(seed, 6, index);
+                for module in index * CHUNK..((index + 1) * CHUNK).min(modules) {
+                    self.face(module, nearest, &mut part, &mut rng);
+                }
+            } else {
+                let tile = index - chunks;
+                self.ground(tile, nearest, &mut part, &mut stream(seed, 7, tile));
             }
             part
-        });
-        let ground = (0..nearest.views.len()).into_par_iter().map(|tile| {
-            let mut part = PointCloud::default();
-            self.ground(tile, nearest, &mut part, &mut stream(seed, 7, tile));
-            part
-        });
-        let parts: Vec<PointCloud> = faces.chain(ground).collect();
-        let count = parts.iter().map(|part| part.positions_m.len()).sum();
-        let mut cloud = PointCloud { positions_m: Vec::with_capacity(count), normals: Vec::with_capacity(count) };
-        for part in parts {
-            cloud.positions_m.extend(part.positions_m);
-            cloud.normals.extend(part.normals);
+        };
+        let mut cloud = PointCloud::default();
+        let indices: Vec<usize> = (0..chunks + nearest.views.len()).collect();
+        for batch in indices.chunks(BATCH) {
+            let parts: Vec<PointCloud> = batch.par_iter().map(|&index| part(index)).collect();
+            for part in parts {
+                cloud.positions_m.extend(part.positions_m);
+                cloud.normals.extend(part.normals);
+            }
         }
         cloud
     }
 
     fn push(&self, cloud: &mut PointCloud, point_m: Vector3<f64>, normal: Vector3<f64>, rng: &mut StdRng) {
-        let normal = (normal + normal_vector(rng) * self.errors.normal_noise_rad).normalize();
+        // Even draws with the stated deviation: there are millions of them, and normal ones cost more.
+        let noise =
+            Vector3::new(signed(rng), signed(rng), signed(rng)) * (self.errors.normal_noise_rad * 3.0_f64.sqrt());
+        let normal = (normal + noise).normalize();
         cloud.positions_m.push(point_m.cast::<f32>().into());
         cloud.normals.push(normal.cast::<f32>().into());
     }
@@ -256,12 +265,25 @@ impl World<'_> {
         let corner =
             nearest.low_m + Vector2::new((tile % nearest.size[0]) as f64, (tile / nearest.size[0]) as f64) * TILE_M;
         let view = nearest.views[tile] as usize;
-        let around: Vec<usize> =
-            self.grid.within(corner - Vector2::repeat(2.0), corner + Vector2::repeat(TILE_M + 2.0)).collect();
+        // Modules that may hide a place, by sixteen parts of the tile.
+        let mut hiding: [Vec<&TruthModule>; 16] = Default::default();
+        let part = |offset_m: f64| ((offset_m / TILE_M * 4.0).max(0.0) as usize).min(3);
+        for module in self.grid.within(corner - Vector2::repeat(2.0), corner + Vector2::repeat(TILE_M + 2.0)) {
+            let module = &self.truth.modules[module];
+            let middle = module.center_enu_m.xy() - corner;
+            let reach = module.half_along_m.xy().abs() + module.half_up_m.xy().abs();
+            for y in part(middle.y - reach.y)..=part(middle.y + reach.y) {
+                for x in part(middle.x - reach.x)..=part(middle.x + reach.x) {
+                    hiding[4 * y + x].push(module);
+                }
+            }
+        }
         for _ in 0..whole(TILE_M * TILE_M * self.errors.cloud_points_per_m2, rng) {
-            let place = corner + Vector2::new(rng.random::<f64>(), rng.random::<f64>()) * TILE_M;
+            let offset = Vector2::new(rng.random::<f64>(), rng.random::<f64>()) * TILE_M;
+            let place = corner + offset;
             let depth_error_m = self.errors.cloud_noise_m * normal(rng);
-            if around.iter().any(|&module| self.truth.modules[module].place_on_face(place).amax() <= 1.0) {
+            let near = &hiding[4 * part(offset.y) + part(offset.x)];
+            if near.iter().any(|module| module.place_on_face(place).amax() <= 1.0) {
                 continue;
             }
             let point = place.push(self.truth.terrain.height_m(place));
