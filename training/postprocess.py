@@ -30,7 +30,7 @@ OVERLAP = 0.2
 MIN_AREA = 6
 ALONE = 0.9  # score from which a box needs no neighbour
 LATTICE = 0.2  # tolerance of a neighbour's place, in modules
-SIZE_SIGMA = 0.25  # of the logarithm of sizes, likewise
+SIZE_SIGMA = 0.35  # of the logarithm of sizes, likewise
 REACH = 2.0  # of the averaging over neighbours, in module sizes
 
 

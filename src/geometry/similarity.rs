@@ -35,7 +35,7 @@ impl Similarity {
         let (u, v_t) = (svd.u?, svd.v_t?);
         let mut singular: Vec<(f64, usize)> = svd.singular_values.iter().copied().zip(0..).collect();
         singular.sort_by(|a, b| b.0.total_cmp(&a.0));
-        if !(singular[1].0 > 1e-9 * singular[0].0) {
+        if singular[1].0.partial_cmp(&(1e-9 * singular[0].0)) != Some(std::cmp::Ordering::Greater) {
             return None;
         }
         let mut signs = Vector3::repeat(1.0);
