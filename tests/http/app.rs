@@ -158,9 +158,12 @@ impl App {
         let store: Arc<dyn Store> = Arc::new(SqliteStore::open(&folder.path().join("heliomap.db")).await.unwrap());
         let blobs = Blobs::in_folder(folder.path()).unwrap();
         let bell = Arc::new(Notify::new());
-        let mapper =
-            Arc::new(ScriptedMapper { acts: Mutex::new(acts.iter().copied().collect()), seen: Mutex::default() });
         let stop = CancellationToken::new();
+        let mapper = Arc::new(ScriptedMapper {
+            acts: Mutex::new(acts.iter().copied().collect()),
+            seen: Mutex::default(),
+            closing: stop.clone(),
+        });
         if !acts.is_empty() {
             let worker = Worker {
                 name: "test".to_owned(),

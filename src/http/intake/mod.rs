@@ -37,7 +37,9 @@ pub async fn store(
     survey: SurveyId,
     files: Vec<Checked>,
 ) -> Result<Vec<(FileRecord, FileWritten)>, ApiError> {
-    let stored = Timestamp::now();
+    // As exact as the store keeps it, so that every answer says the same.
+    let now = Timestamp::now();
+    let stored = Timestamp::from_millisecond(now.as_millisecond()).unwrap_or(now);
     let mut records = Vec::with_capacity(files.len());
     for Checked { path, staged, size_px } in files {
         records.push(FileRecord { path, size: staged.size, sha256: staged.sha256, size_px, stored });
