@@ -166,7 +166,7 @@ def test_sets() -> dict[str, list[tuple[Photo, float]]]:
     sets["real held out, 1/3"] = [(p, 1 / 3) for p in held]
     west = sources.west_test()
     if west:
-        sets["missouri-west, north"] = [(p, 1.0) for p in west]
+        sets["missouri-west, northern line"] = [(p, 1.0) for p in west]
     return sets
 
 
