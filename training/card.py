@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-HEAD = """# unet.onnx
+HEAD = """# {name}
 
 Version {version}, {size:.1f} MB, {steps} steps of training. Written by `python -m training.evaluate`: do not edit.
 
@@ -15,7 +15,7 @@ A small residual U-Net that marks photovoltaic modules in drone photos. It is ou
 | input `image` | float32 [N, 3, H, W], RGB in 0..1, H and W multiples of 32 |
 | output `masks` | float32 [N, 2, H, W], probabilities: `module` (the face within its four corners), `core` (the face shrunk to {shrink} about its centre, so that neighbours never touch) |
 | working distance | {gsd} m per pixel; trained for {gsd_range} m (a module's short side 9 to 44 pixels) |
-| speed | {speed:.2f} s per megapixel, ONNX Runtime, {threads} threads, float32, best of eight 1344 x 896 images in the run that wrote this card |
+| speed | {speed:.2f} s per megapixel, ONNX Runtime, {threads} threads, {kind}, best of eight 1344 x 896 images in the run that wrote this card |
 
 Metadata of the file (`heliomap.*`) says the same to programs. From masks to boxes: `training/postprocess.py`.
 
@@ -58,8 +58,11 @@ TAIL = """
 
 def write_card(path: Path, model: Path, meta: dict, rows: dict[str, dict], speed: float, threads: int) -> None:
     frames = meta.get("heliomap.self_frames", "0")
+    version = meta.get("heliomap.version", "?")
     text = HEAD.format(
-        version=meta.get("heliomap.version", "?"),
+        name=model.name,
+        kind="8-bit weights and activations" if version.endswith(".int8") else "float32",
+        version=version,
         size=model.stat().st_size / 1e6,
         steps=meta.get("heliomap.steps", "?"),
         shrink=meta.get("heliomap.core_shrink", "?"),
