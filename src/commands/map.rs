@@ -55,7 +55,7 @@ pub struct MapArgs {
     #[arg(long, value_name = "M")]
     max_gsd: Option<f64>,
     /// Known spacing of module centres along and across the row in metres, for example 1.02,1.67: fixes the scale
-    #[arg(long, value_name = "ALONG,ACROSS", value_delimiter = ',', num_args = 2)]
+    #[arg(long, value_name = "ALONG,ACROSS", value_delimiter = ',')]
     spacing: Option<Vec<f64>>,
     /// How positions are refined
     #[arg(long, value_enum, default_value_t = MethodArg::Lattice)]
@@ -100,7 +100,7 @@ pub fn run(args: &MapArgs) -> anyhow::Result<()> {
             MethodArg::Lattice => Method::Lattice,
             MethodArg::Paper => Method::Paper,
         },
-        max_image_pixels: args.max_megapixels * 1_000_000,
+        max_image_pixels: args.max_megapixels.saturating_mul(1_000_000),
         seed: args.seed,
     };
     let folder_name = args.folder.canonicalize().ok().and_then(|f| Some(f.file_name()?.to_string_lossy().into_owned()));

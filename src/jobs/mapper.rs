@@ -54,10 +54,21 @@ impl Mapper for PipelineMapper {
         observer: &dyn Observer,
     ) -> Result<PlantModel, MapError> {
         let detector = self.detector()?;
-        let mapping = pipeline::map_folder(folder, Boxes::Detector(&*detector), options, subject, observer)?;
+        let mapping = pipeline::map_folder(folder, Boxes::Detector(&*detector), options, subject, observer)
+            .map_err(|error| as_in_the_survey(error, folder))?;
         for timing in &mapping.timings {
             tracing::debug!(stage = timing.stage.as_str(), seconds = timing.wall.as_secs_f64(), "stage finished");
         }
         Ok(mapping.model)
+    }
+}
+
+/// Files by their names in the survey: where the worker laid them is nobody's business.
+fn as_in_the_survey(error: MapError, folder: &Path) -> MapError {
+    match error {
+        MapError::Input { code, message } => {
+            MapError::Input { code, message: message.replace(&format!("{}/", folder.display()), "") }
+        }
+        other => other,
     }
 }

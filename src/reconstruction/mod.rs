@@ -1,6 +1,7 @@
 //! What structure from motion gives us, as one type, with one reader per producer.
 
 pub mod error;
+mod jpeg;
 pub mod opensfm;
 pub mod photo;
 pub mod ply;

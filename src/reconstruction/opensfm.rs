@@ -220,7 +220,7 @@ fn read_json<T: DeserializeOwned>(path: &Path, limit: u64) -> Result<T, Reconstr
                 return ReconstructionError::NotFinite {
                     path: path.to_owned(),
                     value: word.to_owned(),
-                    place: format!("line {}", error.line()),
+                    place: format!("line {}, column {}", error.line(), error.column()),
                 };
             }
         }

@@ -1,12 +1,13 @@
 //! Photos: checked by their header before anything is decoded, decoded whole or refused, undistorted where the file is
 //! as the lens drew it.
 
+use super::jpeg::{self, JpegError};
 use crate::geometry::Camera;
-use image::{ImageFormat, ImageReader, RgbImage};
+use image::{DynamicImage, ImageError, ImageFormat, ImageReader, RgbImage};
 use nalgebra::Vector2;
 use rayon::prelude::*;
 use std::fs::File;
-use std::io::{BufRead, BufReader, Read, Seek};
+use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 /// Default for the most pixels that an image may have: 100 megapixels.
@@ -19,7 +20,10 @@ pub enum PhotoError {
     Unreadable { name: String, source: std::io::Error },
     #[error("{name} is no image that can be read (JPEG, PNG or TIFF): {what}; copy it from the camera again")]
     NotAnImage { name: String, what: String },
-    #[error("{name} is named as {named} but holds {held}: name it by what it is, or export it again")]
+    #[error(
+        "{name} holds a {held} but is named as a {named}: convert it to {named}, or name it by what it is here and in the \
+         reconstruction"
+    )]
     WrongName { name: String, named: &'static str, held: &'static str },
     #[error(
         "{name} is {width} x {height} pixels, more than the {limit} pixels allowed: scale it down, or raise the limit"
@@ -60,20 +64,21 @@ fn format_name(format: ImageFormat) -> &'static str {
 }
 
 /// Checks a photo without decoding it: its format by content and by `name` (what the user calls it), its size against
-/// `max_pixels`, and that a JPEG's image data has an end.
+/// `max_pixels`, and that a JPEG or PNG runs to its end.
+///
+/// # Errors
+/// What is wrong with the photo.
 pub fn inspect(path: &Path, name: &str, max_pixels: u64) -> Result<PhotoHeader, PhotoError> {
     let unreadable = |source| PhotoError::Unreadable { name: name.to_owned(), source };
-    let reader = ImageReader::open(path).map_err(unreadable)?.with_guessed_format().map_err(unreadable)?;
-    let not_an_image = |what: String| PhotoError::NotAnImage { name: name.to_owned(), what };
-    // `open` starts from the path's extension; only the content counts here.
-    let format = {
-        let mut start = Vec::new();
-        File::open(path).map_err(unreadable)?.take(64).read_to_end(&mut start).map_err(unreadable)?;
-        image::guess_format(&start).map_err(|_| not_an_image("its first bytes are of no known format".to_owned()))?
-    };
-    if !matches!(format, ImageFormat::Jpeg | ImageFormat::Png | ImageFormat::Tiff) {
-        return Err(not_an_image("its format is another".to_owned()));
-    }
+    let not_an_image = |what: &str| PhotoError::NotAnImage { name: name.to_owned(), what: what.to_owned() };
+    let mut file = File::open(path).map_err(unreadable)?;
+    let mut start = Vec::new();
+    file.by_ref().take(64).read_to_end(&mut start).map_err(unreadable)?;
+    file.rewind().map_err(unreadable)?;
+    let format = image::guess_format(&start)
+        .ok()
+        .filter(|format| matches!(format, ImageFormat::Jpeg | ImageFormat::Png | ImageFormat::Tiff))
+        .ok_or_else(|| not_an_image("it begins otherwise"))?;
     let extension = Path::new(name).extension().and_then(|e| e.to_str()).unwrap_or("").to_ascii_lowercase();
     let named = match extension.as_str() {
         "jpg" | "jpeg" => Some(ImageFormat::Jpeg),
@@ -88,71 +93,103 @@ pub fn inspect(path: &Path, name: &str, max_pixels: u64) -> Result<PhotoHeader, 
             held: format_name(format),
         });
     }
-    let (width, height) = reader.into_dimensions().map_err(|error| not_an_image(error.to_string()))?;
-    if u64::from(width) * u64::from(height) > max_pixels {
-        return Err(PhotoError::TooLarge { name: name.to_owned(), width, height, limit: max_pixels });
-    }
-    if width == 0 || height == 0 {
-        return Err(not_an_image("it has no pixels".to_owned()));
-    }
-    if format == ImageFormat::Jpeg {
-        let file = BufReader::with_capacity(1 << 18, File::open(path).map_err(unreadable)?);
-        if !jpeg_has_an_end(file).map_err(unreadable)? {
-            return Err(PhotoError::Truncated { name: name.to_owned() });
+    let within = |size: [u32; 2]| u64::from(size[0]) * u64::from(size[1]) <= max_pixels;
+    let size_px = match format {
+        ImageFormat::Jpeg => {
+            let reader = BufReader::with_capacity(1 << 18, file);
+            jpeg::walk(reader, within).map_err(|error| match error {
+                JpegError::CutShort => PhotoError::Truncated { name: name.to_owned() },
+                JpegError::Malformed(what) => not_an_image(what),
+                JpegError::Io(source) => unreadable(source),
+            })?
         }
+        ImageFormat::Png => png_size(file, name)?,
+        _ => tiff_size(file, name)?,
+    };
+    let [width_px, height_px] = size_px;
+    if width_px == 0 || height_px == 0 {
+        return Err(not_an_image("it has no pixels"));
     }
-    Ok(PhotoHeader { width_px: width, height_px: height, format })
+    if !within(size_px) {
+        return Err(PhotoError::TooLarge {
+            name: name.to_owned(),
+            width: width_px,
+            height: height_px,
+            limit: max_pixels,
+        });
+    }
+    Ok(PhotoHeader { width_px, height_px, format })
 }
 
-/// Whether the image data of a JPEG runs to its end-of-image marker. Decoders fill what is missing with grey and say
-/// nothing, so this is looked for in the file: segments are skipped by their length (a thumbnail in one of them has an
-/// end of its own), and entropy-coded data cannot hold the marker by chance.
-fn jpeg_has_an_end(mut file: impl BufRead + Seek) -> std::io::Result<bool> {
-    let mut in_scan = false;
+/// Walks a PNG's chunks to its end.
+fn png_size(mut file: File, name: &str) -> Result<[u32; 2], PhotoError> {
+    let cut = |error: std::io::Error| match error.kind() {
+        std::io::ErrorKind::UnexpectedEof => PhotoError::Truncated { name: name.to_owned() },
+        _ => PhotoError::Unreadable { name: name.to_owned(), source: error },
+    };
+    let not_an_image = |what: &str| PhotoError::NotAnImage { name: name.to_owned(), what: what.to_owned() };
+    let length = file.seek(SeekFrom::End(0)).map_err(cut)?;
+    file.seek(SeekFrom::Start(8)).map_err(cut)?;
+    let mut reader = BufReader::new(file);
+    let mut at = 8;
+    let mut size_px = None;
     loop {
-        let mut byte = [0_u8];
-        if in_scan {
-            // Skip to the next 0xFF.
-            let skipped = file.fill_buf()?;
-            if skipped.is_empty() {
-                return Ok(false);
-            }
-            match skipped.iter().position(|b| *b == 0xFF) {
-                Some(at) => file.consume(at + 1),
-                None => {
-                    let all = skipped.len();
-                    file.consume(all);
-                    continue;
-                }
-            }
-        } else {
-            if file.read(&mut byte)? == 0 {
-                return Ok(false);
-            }
-            if byte[0] != 0xFF {
-                continue;
-            }
+        let mut head = [0; 8];
+        reader.read_exact(&mut head).map_err(cut)?;
+        let chunk = u64::from(u32::from_be_bytes([head[0], head[1], head[2], head[3]]));
+        at += 8 + chunk + 4;
+        if at > length {
+            return Err(PhotoError::Truncated { name: name.to_owned() });
         }
-        let mut marker = 0xFF;
-        while marker == 0xFF {
-            if file.read(&mut byte)? == 0 {
-                return Ok(false);
+        match (&head[4..], size_px) {
+            (b"IHDR", None) if chunk == 13 => {
+                let mut size = [0; 8];
+                reader.read_exact(&mut size).map_err(cut)?;
+                let number = |at: usize| u32::from_be_bytes([size[at], size[at + 1], size[at + 2], size[at + 3]]);
+                size_px = Some([number(0), number(4)]);
+                reader.seek_relative(5 + 4).map_err(cut)?;
             }
-            marker = byte[0];
-        }
-        match marker {
-            0xD9 => return Ok(true),
-            0x00 | 0x01 | 0xD0..=0xD8 => {}
-            _ => {
-                let mut length = [0_u8; 2];
-                if let Err(error) = file.read_exact(&mut length) {
-                    return if error.kind() == std::io::ErrorKind::UnexpectedEof { Ok(false) } else { Err(error) };
-                }
-                file.seek_relative(i64::from(u16::from_be_bytes(length)).saturating_sub(2))?;
-                in_scan = marker == 0xDA;
-            }
+            (_, None) => return Err(not_an_image("its header is missing")),
+            (b"IEND", Some(size_px)) => return Ok(size_px),
+            _ => reader.seek_relative(chunk as i64 + 4).map_err(cut)?,
         }
     }
+}
+
+fn tiff_size(file: File, name: &str) -> Result<[u32; 2], PhotoError> {
+    let mut reader = ImageReader::new(BufReader::new(file));
+    reader.set_format(ImageFormat::Tiff);
+    let (width, height) = reader.into_dimensions().map_err(|error| undecodable(name, error))?;
+    Ok([width, height])
+}
+
+/// What it means that an image cannot be decoded.
+fn undecodable(name: &str, error: ImageError) -> PhotoError {
+    match error {
+        ImageError::IoError(error) if error.kind() == std::io::ErrorKind::UnexpectedEof => {
+            PhotoError::Truncated { name: name.to_owned() }
+        }
+        error => PhotoError::NotAnImage { name: name.to_owned(), what: error.to_string() },
+    }
+}
+
+/// As [`inspect`], and decodes what does not tell by its structure whether it is whole (TIFF).
+///
+/// # Errors
+/// What is wrong with the photo.
+pub fn inspect_whole(path: &Path, name: &str, max_pixels: u64) -> Result<PhotoHeader, PhotoError> {
+    let header = inspect(path, name, max_pixels)?;
+    if header.format == ImageFormat::Tiff {
+        decode(path, name, header.format)?;
+    }
+    Ok(header)
+}
+
+fn decode(path: &Path, name: &str, format: ImageFormat) -> Result<DynamicImage, PhotoError> {
+    let unreadable = |source| PhotoError::Unreadable { name: name.to_owned(), source };
+    let mut reader = ImageReader::new(BufReader::new(File::open(path).map_err(unreadable)?));
+    reader.set_format(format);
+    reader.decode().map_err(|error| undecodable(name, error))
 }
 
 /// A photo on disk that belongs to a shot.
@@ -178,13 +215,7 @@ impl Photo {
     /// Data that does not decode.
     pub fn load(&self) -> Result<RgbImage, PhotoError> {
         let name = self.path.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned());
-        let unreadable = |source| PhotoError::Unreadable { name: name.clone(), source };
-        let mut reader = ImageReader::new(BufReader::new(File::open(&self.path).map_err(unreadable)?));
-        reader.set_format(self.header.format);
-        let decoded = reader
-            .decode()
-            .map_err(|error| PhotoError::NotAnImage { name: name.clone(), what: error.to_string() })?
-            .into_rgb8();
+        let decoded = decode(&self.path, &name, self.header.format)?.into_rgb8();
         if self.camera.is_undistorted() { Ok(decoded) } else { Ok(undistort(&decoded, &self.camera)) }
     }
 }

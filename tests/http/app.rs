@@ -1,9 +1,10 @@
 //! A service of its own for each test.
 
 use heliomap::config::Limits;
+use heliomap::detection::Detector;
 use heliomap::geometry::{GeodeticReference, Lla};
 use heliomap::http::{AppState, router};
-use heliomap::jobs::{Mapper, Worker, WorkerSettings};
+use heliomap::jobs::{Mapper, PipelineMapper, Worker, WorkerSettings};
 use heliomap::pipeline::{MapError, MapOptions, Observer, Stage, Subject};
 use heliomap::plant::{
     Bench, BenchId, Line, LineId, Module, ModuleId, ModuleStatus, PlantModel, Sector, SectorId, Warning,
@@ -154,22 +155,40 @@ impl App {
 
     /// With limits of its own.
     pub async fn with_limits(acts: &[Act], limits: Limits) -> Self {
-        let folder = tempfile::tempdir().unwrap();
-        let store: Arc<dyn Store> = Arc::new(SqliteStore::open(&folder.path().join("heliomap.db")).await.unwrap());
-        let blobs = Blobs::in_folder(folder.path()).unwrap();
-        let bell = Arc::new(Notify::new());
         let stop = CancellationToken::new();
         let mapper = Arc::new(ScriptedMapper {
             acts: Mutex::new(acts.iter().copied().collect()),
             seen: Mutex::default(),
             closing: stop.clone(),
         });
-        if !acts.is_empty() {
+        let working = (!acts.is_empty()).then(|| mapper.clone() as Arc<dyn Mapper>);
+        Self::start(working, mapper, limits, stop).await
+    }
+
+    /// With a worker that maps in earnest, by this detector.
+    pub async fn with_detector(detector: Arc<dyn Detector>) -> Self {
+        let stop = CancellationToken::new();
+        let unused = Arc::new(ScriptedMapper { acts: Mutex::default(), seen: Mutex::default(), closing: stop.clone() });
+        let mapper = PipelineMapper::new(Box::new(move || Ok(detector.clone())));
+        Self::start(Some(Arc::new(mapper)), unused, Limits::default(), stop).await
+    }
+
+    async fn start(
+        working: Option<Arc<dyn Mapper>>,
+        mapper: Arc<ScriptedMapper>,
+        limits: Limits,
+        stop: CancellationToken,
+    ) -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let store: Arc<dyn Store> = Arc::new(SqliteStore::open(&folder.path().join("heliomap.db")).await.unwrap());
+        let blobs = Blobs::in_folder(folder.path()).unwrap();
+        let bell = Arc::new(Notify::new());
+        if let Some(mapper) = working {
             let worker = Worker {
                 name: "test".to_owned(),
                 store: store.clone(),
                 blobs: blobs.clone(),
-                mapper: mapper.clone(),
+                mapper,
                 settings: WorkerSettings {
                     lease: Duration::from_secs(10),
                     heartbeat: Duration::from_millis(10),

@@ -1,6 +1,9 @@
 //! The HTTP API in process: real store, real worker, a mapper that does as it is told.
 
 mod app;
+#[path = "../common/boxes.rs"]
+mod boxes;
+mod broken;
 mod contract;
 mod images;
 mod jobs;

@@ -132,7 +132,10 @@ fn a_broken_reconstruction_fails_its_job() {
     let (_, job) = broken_survey_with_job(&client, &base);
     let job = follow(&client, &base, &job);
     assert_eq!((&job["state"], &job["attempt"]), (&json!("failed"), &json!(1)), "{job}");
-    assert!(job["error"]["code"].is_string() && job["error"]["message"].is_string(), "{job}");
+    assert_eq!(job["error"]["code"], "reconstruction_malformed", "{job}");
+    let message = job["error"]["message"].as_str().unwrap();
+    assert!(message.starts_with("reconstruction.json is not what OpenSfM writes"), "{message}");
+    assert!(message.ends_with("export it again"), "{message}");
 }
 
 #[test]

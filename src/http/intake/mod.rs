@@ -2,7 +2,6 @@
 
 pub mod archive;
 pub mod content;
-pub mod jpeg;
 pub mod receive;
 
 use super::error::{ApiError, Code};

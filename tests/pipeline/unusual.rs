@@ -1,0 +1,78 @@
+//! Surveys that are not as they should be and are mapped all the same, with a word about it.
+
+use crate::survey::{CLOUD, Survey, can_detect};
+use image::{Rgb, RgbImage};
+use serde_json::json;
+
+/// Grass, as far as the eye can see: the same on every machine.
+fn grass() -> Vec<u8> {
+    let mut state = 1_u32;
+    let grass = RgbImage::from_fn(1368, 912, |_, _| {
+        state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        let shade = (state >> 27) as u8;
+        Rgb([60 + shade, 96 + shade, 40 + shade / 2])
+    });
+    let mut bytes = std::io::Cursor::new(Vec::new());
+    grass.write_to(&mut bytes, image::ImageFormat::Jpeg).unwrap();
+    bytes.into_inner()
+}
+
+#[test]
+fn two_components_are_mapped_with_a_warning() {
+    let survey = Survey::new();
+    survey.edit(|reconstruction| {
+        let mut second = reconstruction[0].clone();
+        let in_second = |name: &str| ["DJI_0009.jpg", "DJI_0010.jpg"].contains(&name);
+        reconstruction[0]["shots"].as_object_mut().unwrap().retain(|name, _| !in_second(name));
+        second["shots"].as_object_mut().unwrap().retain(|name, _| in_second(name));
+        reconstruction.as_array_mut().unwrap().push(second);
+    });
+    let summary = survey.maps_with_warnings(true, &[("several_components", &[])]);
+    assert_eq!(summary["modules"], 434);
+}
+
+#[test]
+fn without_a_dense_cloud_the_sparse_points_serve() {
+    let survey = Survey::new();
+    survey.remove(CLOUD);
+    let summary = survey.maps_with_warnings(true, &[("no_dense_cloud", &[])]);
+    assert!(summary["modules"].as_u64().unwrap() > 400, "{summary}");
+}
+
+#[test]
+fn a_photo_without_modules_is_named() {
+    if !can_detect() {
+        return;
+    }
+    let survey = Survey::new();
+    survey.write("images/DJI_0004.jpg", grass());
+    let summary = survey.maps_with_warnings(
+        false,
+        &[("images_supplementary", &["DJI_0009.jpg", "DJI_0010.jpg"]), ("image_without_modules", &["DJI_0004.jpg"])],
+    );
+    assert!(summary["modules"].as_u64().unwrap() > 300, "{summary}");
+    for module in survey.modules() {
+        assert!(!module["properties"]["images"].as_array().unwrap().contains(&json!("DJI_0004.jpg")), "{module}");
+    }
+}
+
+#[test]
+fn a_plant_without_a_single_gap_is_mapped() {
+    let survey = Survey::new();
+    survey.write_boxes(|module| module["bench"] == 4);
+    let summary = survey.map(true, &[]);
+    assert_eq!(summary.code, Some(0), "{}", summary.stderr);
+    let labels: std::collections::BTreeSet<String> =
+        survey.modules().iter().map(|module| module["properties"]["bench"].to_string()).collect();
+    assert_eq!(labels.len(), 1, "{labels:?}");
+    assert!(survey.modules().len() >= 30);
+}
+
+#[test]
+fn boxes_of_other_images_are_left_out_with_a_warning() {
+    let survey = Survey::new();
+    survey.edit(|reconstruction| {
+        reconstruction[0]["shots"].as_object_mut().unwrap().remove("DJI_0008.jpg");
+    });
+    survey.maps_with_warnings(true, &[("boxes_without_shot", &["DJI_0008.jpg"])]);
+}

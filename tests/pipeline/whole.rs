@@ -1,0 +1,55 @@
+//! The example plant, from photos to GeoJSON and against its truth.
+
+use crate::boxes::EXAMPLE;
+use crate::survey::{Survey, can_detect, heliomap};
+use serde_json::Value;
+
+#[test]
+fn the_example_is_mapped_without_a_fault_whatever_the_number_of_threads() {
+    if !can_detect() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let files = ["plant", "plant-sectors", "plant-benches", "plant-lines"];
+    let [one, two] = ["1", "2"].map(|threads| {
+        let out = folder.path().join(threads).join("plant.geojson");
+        let said = heliomap(&["map", EXAMPLE, "--out", out.to_str().unwrap(), "--layers", "--threads", threads]);
+        assert_eq!(said.code, Some(0), "{}", said.stderr);
+        files.map(|name| std::fs::read(out.with_file_name(format!("{name}.geojson"))).unwrap())
+    });
+    for (name, (one, two)) in files.iter().zip(one.iter().zip(&two)) {
+        assert!(one == two, "{name} differs between one thread and two");
+    }
+
+    let plant = folder.path().join("1/plant.geojson");
+    let truth = format!("{EXAMPLE}/truth.json");
+    let said = heliomap(&["evaluate", plant.to_str().unwrap(), &truth, "--strict", "--json", "-"]);
+    assert_eq!(said.code, Some(0), "{}", said.stderr);
+    let evaluation: Value = serde_json::from_str(&said.stdout).unwrap();
+    assert_eq!((&evaluation["found"], &evaluation["structure"]["exact"]), (&434.into(), &true.into()));
+    let differences = &evaluation["after_similarity_fit"];
+    let at_most = |axis: &str, number: &str, limit_m: f64| {
+        let found_m = differences[axis][number].as_f64().unwrap();
+        assert!(found_m <= limit_m, "{axis} {number}: {found_m} m, at most {limit_m} m are allowed");
+    };
+    at_most("horizontal", "median", 0.03);
+    at_most("vertical", "median", 0.05);
+    at_most("horizontal", "max", 0.25);
+    at_most("vertical", "max", 0.25);
+}
+
+#[test]
+fn true_boxes_in_the_place_of_a_detector_give_the_plant() {
+    let survey = Survey::new();
+    let summary = survey.maps_with_warnings(true, &[]);
+    assert_eq!((&summary["modules"], &summary["warnings"]), (&434.into(), &Value::Array(Vec::new())), "{summary}");
+    assert_eq!((&summary["lines"], &summary["benches"], &summary["sectors"]), (&4.into(), &12.into(), &24.into()));
+}
+
+#[test]
+fn a_known_spacing_is_taken() {
+    let survey = Survey::new();
+    let said = survey.map(true, &["--spacing", "1.02,1.67", "--rows-per-bench", "2"]);
+    assert_eq!(said.code, Some(0), "{}", said.stderr);
+    assert_eq!(survey.modules().len(), 434);
+}
