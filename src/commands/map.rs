@@ -225,12 +225,12 @@ impl Observer for Report {
             bar.set_position(done as u64);
             return;
         }
-        let tenth = if total == 0 { 10 } else { done * 10 / total };
-        if let Ok(mut last) = self.last.lock() {
-            if *last != Some((stage, tenth)) {
-                *last = Some((stage, tenth));
-                eprintln!("{}: {done} of {total}", stage.as_str());
-            }
+        let tenth = (done * 10).checked_div(total).unwrap_or(10);
+        if let Ok(mut last) = self.last.lock()
+            && *last != Some((stage, tenth))
+        {
+            *last = Some((stage, tenth));
+            eprintln!("{}: {done} of {total}", stage.as_str());
         }
     }
 }
