@@ -17,7 +17,7 @@ export ORT_DYLIB_PATH ?= $(abspath $(ORT_LIBRARY))
 HELIOMAP_DATA ?= $(wildcard ../shared/data)
 export HELIOMAP_DATA
 
-.PHONY: help setup web demo test lint unit bench openapi clean
+.PHONY: help setup web demo test lint unit structure bench openapi clean
 
 help: ## List the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -50,6 +50,9 @@ lint: setup ## Formatting and lints, warnings are errors
 
 unit: setup ## Tests alone
 	$(CARGO) test --locked
+
+structure: setup ## Survey of every kind of simulated layout: how many come out exactly
+	$(CARGO) test --locked --test structure -- --ignored --nocapture
 
 bench: setup ## Benchmarks of layout, locate, fusion and refinement
 	$(CARGO) bench --locked

@@ -151,8 +151,8 @@ pub fn associate(pieces: &[LocatedPiece], options: &FusionOptions) -> Clusters {
             _ => {}
         }
     }
-    // What is left lies over each other without a sure shift: two benches cannot, so the likeliest shift joins them and
-    // the doubt is told.
+    // What is left lies over each other without a sure shift. All its pairs together may still decide; where they do not,
+    // a guess would invent modules: the pieces stay apart, the doubt is told, and the lesser one goes as a ghost.
     let mut left: BTreeMap<(usize, usize), Vec<usize>> = BTreeMap::new();
     for &k in &order {
         let (a, b) = (forest.root(pairs[k].a), forest.root(pairs[k].b));
@@ -170,12 +170,12 @@ pub fn associate(pieces: &[LocatedPiece], options: &FusionOptions) -> Clusters {
         else {
             continue;
         };
-        if let Joined::New = forest.join(pieces, a, b, best.0, best.1, margin_per_view) {
-            if margin < LIKELY {
-                let mut shown = vec![best.0];
-                shown.extend(second.map(|second| second.0).filter(|second| *second != best.0));
-                doubts.push(Undecided { code: "bench_shift_unsure", a, b, choices: shown, margin });
-            }
+        if margin >= LIKELY {
+            forest.join(pieces, a, b, best.0, best.1, margin_per_view);
+        } else {
+            let mut shown = vec![best.0];
+            shown.extend(second.map(|second| second.0).filter(|second| *second != best.0));
+            doubts.push(Undecided { code: "bench_shift_unsure", a, b, choices: shown, margin });
         }
     }
     forest.clusters(doubts)

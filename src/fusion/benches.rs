@@ -191,6 +191,9 @@ pub fn without_ghosts(views: &[View<'_>], benches: Vec<FusedBench>, doubts: &mut
         module.observations.iter().map(|o| o.position_m.xy()).sum::<Vector2<f64>>() / count
     };
     let weight = |bench: &FusedBench| bench.modules.iter().map(|m| m.observations.len()).sum::<usize>();
+    let view_count = |bench: &FusedBench| {
+        bench.modules.iter().flat_map(|m| m.observations.iter().map(|o| o.view)).collect::<BTreeSet<_>>().len()
+    };
     let mut order: Vec<usize> = (0..benches.len()).collect();
     order.sort_by_key(|k| (std::cmp::Reverse(weight(&benches[*k])), *k));
     let tree = RTree::bulk_load(
@@ -208,8 +211,11 @@ pub fn without_ghosts(views: &[View<'_>], benches: Vec<FusedBench>, doubts: &mut
     let mut kept = vec![false; benches.len()];
     for &index in &order {
         let bench = &benches[index];
-        let [u, v] = bench.pitch_m;
-        let reach = 0.6 * u.norm().min(if bench.rows > 1 { v.norm() } else { u.norm() });
+        let [u, v] = bench.pitch_m.map(|pitch| pitch.norm());
+        let across = if bench.rows > 1 { v } else { u };
+        // What one or two views alone saw may be displaced by as much as their poses err.
+        let weak = view_count(bench) <= 2;
+        let reach = if weak { (0.75 * u.max(across)).max(0.6 * u.min(across)).min(1.3) } else { 0.6 * u.min(across) };
         let mut covered = 0;
         let mut over = None;
         for module in &bench.modules {
@@ -217,6 +223,7 @@ pub fn without_ghosts(views: &[View<'_>], benches: Vec<FusedBench>, doubts: &mut
             let other = tree
                 .locate_within_distance([at.x, at.y], reach * reach)
                 .filter(|near| near.data != index && kept[near.data])
+                .filter(|near| !weak || view_count(&benches[near.data]) > view_count(bench))
                 .map(|near| near.data)
                 .min();
             if other.is_some() {
@@ -224,7 +231,7 @@ pub fn without_ghosts(views: &[View<'_>], benches: Vec<FusedBench>, doubts: &mut
                 over = other;
             }
         }
-        kept[index] = 3 * covered <= bench.modules.len();
+        kept[index] = if weak { 2 * covered < bench.modules.len() } else { 3 * covered <= bench.modules.len() };
         if !kept[index] {
             let names: BTreeSet<String> = bench
                 .modules

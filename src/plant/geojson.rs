@@ -4,8 +4,10 @@ use super::model::{Module, PlantModel};
 use crate::geometry::GeodeticReference;
 use nalgebra::Vector3;
 use serde_json::{Map, Value, json};
+use std::collections::HashMap;
 use std::fmt;
 use std::str::FromStr;
+use uuid::Uuid;
 
 /// A kind of feature.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -73,32 +75,42 @@ impl PlantModel {
 
     /// The features of one layer, in the order of the model.
     pub fn features(&self, layer: Layer) -> Vec<Value> {
+        let mut members: HashMap<Uuid, Vec<&Module>> = HashMap::new();
+        for module in &self.modules {
+            let group = match layer {
+                Layer::Modules => break,
+                Layer::Sectors => module.sector.0,
+                Layer::Benches => module.bench.0,
+                Layer::Lines => module.line.0,
+            };
+            members.entry(group).or_default().push(module);
+        }
         match layer {
             Layer::Modules => self.modules.iter().map(|module| self.module_feature(module)).collect(),
             Layer::Sectors => self
                 .sectors
                 .iter()
                 .map(|sector| {
-                    let members: Vec<&Module> = self.modules.iter().filter(|m| m.sector == sector.id).collect();
+                    let members = members.get(&sector.id.0).map_or(&[][..], Vec::as_slice);
                     let properties = json!({
                         "id": sector.id, "label": sector.label, "plant": self.plant, "line": sector.line,
                         "bench": sector.bench, "sector": sector.id, "row": sector.row,
                     });
-                    self.group_feature(sector.id.to_string(), &members, properties)
+                    self.group_feature(sector.id.to_string(), members, properties)
                 })
                 .collect(),
             Layer::Benches => self
                 .benches
                 .iter()
                 .map(|bench| {
-                    let members: Vec<&Module> = self.modules.iter().filter(|m| m.bench == bench.id).collect();
+                    let members = members.get(&bench.id.0).map_or(&[][..], Vec::as_slice);
                     let properties = json!({
                         "id": bench.id, "label": bench.label, "plant": self.plant, "line": bench.line, "bench": bench.id,
                         "index": bench.index, "rows": bench.rows, "columns": bench.columns,
                         "open_ended": {"west": bench.open_ended[0], "east": bench.open_ended[1]},
                         "confidence": round(bench.confidence, 3),
                     });
-                    self.group_feature(bench.id.to_string(), &members, properties)
+                    self.group_feature(bench.id.to_string(), members, properties)
                 })
                 .collect(),
             Layer::Lines => self
@@ -106,12 +118,12 @@ impl PlantModel {
                 .iter()
                 .map(|line| {
                     let benches = self.benches.iter().filter(|bench| bench.line == line.id);
-                    let members: Vec<&Module> = self.modules.iter().filter(|m| m.line == line.id).collect();
+                    let members = members.get(&line.id.0).map_or(&[][..], Vec::as_slice);
                     let properties = json!({
                         "id": line.id, "label": line.label, "plant": self.plant, "line": line.id, "index": line.index,
                         "benches": benches.count(),
                     });
-                    self.group_feature(line.id.to_string(), &members, properties)
+                    self.group_feature(line.id.to_string(), members, properties)
                 })
                 .collect(),
         }

@@ -1,0 +1,41 @@
+//! Layout, locate, fusion and refinement on a simulated plant of the paper's size (4974 modules, about 20 photos).
+
+use criterion::{Criterion, criterion_group, criterion_main};
+use heliomap::fusion::{self, FusionOptions, View};
+use heliomap::layout::{self, Layout, LayoutOptions};
+use heliomap::refinement::{self, RefinementOptions};
+use heliomap::simulator::{Errors, Flight, PlantSpec, simulate};
+use rand::SeedableRng;
+use rand::rngs::StdRng;
+
+fn stages(criterion: &mut Criterion) {
+    let spec = PlantSpec::paper_pp1(&mut StdRng::seed_from_u64(1));
+    let simulation = simulate(&spec, &Flight::paper_pp1(), &Errors::paper(), 1);
+    let lay_out = || -> Vec<Layout> {
+        let infer = |detections| layout::infer(detections, None, &LayoutOptions::default());
+        simulation.detections.iter().map(infer).collect()
+    };
+    let layouts = lay_out();
+    let views: Vec<View<'_>> = simulation
+        .reconstruction
+        .shots
+        .iter()
+        .zip(&simulation.detections)
+        .zip(&layouts)
+        .map(|((shot, detections), layout)| View { shot, detections, layout })
+        .collect();
+    let cloud = simulation.reconstruction.dense.clone().unwrap_or_default();
+    let located = fusion::locate::locate(&views, &cloud);
+    let fused = fusion::fuse(&views, &located, &FusionOptions::default());
+
+    let mut group = criterion.benchmark_group("paper-sized plant");
+    group.sample_size(10);
+    group.bench_function("layout", |b| b.iter(lay_out));
+    group.bench_function("locate", |b| b.iter(|| fusion::locate::locate(&views, &cloud)));
+    group.bench_function("fuse", |b| b.iter(|| fusion::fuse(&views, &located, &FusionOptions::default())));
+    group.bench_function("refine", |b| b.iter(|| refinement::refine(&views, &fused, &RefinementOptions::default())));
+    group.finish();
+}
+
+criterion_group!(benches, stages);
+criterion_main!(benches);
