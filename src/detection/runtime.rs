@@ -186,11 +186,12 @@ fn open_session(bytes: &[u8], threads: usize, name: &str) -> Result<Session, Det
     let environment = environment()?;
     let no_model = |what: &str| DetectionError::NotAModel { name: name.to_owned(), what: first_line(what) };
     let threads = if threads == 0 { available_threads() } else { threads };
-    let mut builder = Session::builder(&environment)
-        .map_err(|error| DetectionError::Inference { what: error.to_string() })?
-        .with_optimization_level(GraphOptimizationLevel::All)
-        .and_then(|builder| builder.with_intra_threads(threads))
-        .map_err(|error| DetectionError::Inference { what: error.to_string() })?;
+    let options = || -> ort::Result<_> {
+        Ok(Session::builder(&environment)?
+            .with_optimization_level(GraphOptimizationLevel::All)?
+            .with_intra_threads(threads)?)
+    };
+    let mut builder = options().map_err(|error| DetectionError::Inference { what: error.message().to_owned() })?;
     builder.commit_from_memory(bytes).map_err(|error| no_model(error.message()))
 }
 

@@ -390,3 +390,226 @@ fn probe(
     }
     Ok((channels, upscale))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use image::Rgb;
+    use std::path::PathBuf;
+
+    fn fixture(name: &str) -> PathBuf {
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/detection").join(name)
+    }
+
+    /// The model, or `None`, with the reason printed, where ONNX Runtime is not installed.
+    fn open(path: &Path) -> Option<Result<Unet, DetectionError>> {
+        match Unet::open(path, 1) {
+            Err(DetectionError::RuntimeMissing) => {
+                eprintln!("skipped: {}", DetectionError::RuntimeMissing);
+                None
+            }
+            opened => Some(opened),
+        }
+    }
+
+    /// Bright upright rectangles of 24 x 16 pixels on dark ground, with their centres; anti-aliased.
+    fn picture(width: u32, height: u32, centers: &[(f64, f64)]) -> RgbImage {
+        let reach = |at: u32, center: f64, half: f64| (half + 0.5 - (f64::from(at) - center).abs()).clamp(0.0, 1.0);
+        RgbImage::from_fn(width, height, |x, y| {
+            let covers = |(cx, cy): &(f64, f64)| reach(x, *cx, 12.0) * reach(y, *cy, 8.0);
+            Rgb([(centers.iter().map(covers).sum::<f64>() * 255.0).round() as u8; 3])
+        })
+    }
+
+    fn lattice(from_x: f64, from_y: f64, columns: u32, rows: u32) -> Vec<(f64, f64)> {
+        (0..rows * columns)
+            .map(|i| (from_x + 27.3 * f64::from(i % columns), from_y + 19.4 * f64::from(i / columns)))
+            .collect()
+    }
+
+    fn assert_found(found: &[Detection], centers: &[(f64, f64)], tolerance_px: f64) {
+        assert_eq!(found.len(), centers.len());
+        let mut sum = Vector2::zeros();
+        for &(x, y) in centers {
+            let off = |d: &Detection| d.quad.center() - Vector2::new(x, y);
+            let nearest = found.iter().map(off).min_by(|a, b| a.norm().total_cmp(&b.norm())).unwrap();
+            assert!(nearest.norm() < tolerance_px, "({x}, {y}) is off by ({}, {}) px", nearest.x, nearest.y);
+            sum += nearest;
+        }
+        let mean = sum / centers.len() as f64;
+        assert!(mean.norm() < 0.6 * tolerance_px, "all are off by ({}, {}) px", mean.x, mean.y);
+        for detection in found {
+            let (short, long) = detection.quad.extent_px();
+            assert!((short - 16.0).abs() < 0.7 && (long - 24.0).abs() < 0.7, "{short} x {long} px");
+        }
+    }
+
+    #[test]
+    fn a_network_of_one_channel_needs_no_metadata() {
+        let Some(unet) = open(&fixture("one_channel.onnx")) else { return };
+        let unet = unet.unwrap();
+        let centers = lattice(20.2, 15.6, 5, 4);
+        assert_found(&unet.detect(&picture(170, 100, &centers), None).unwrap(), &centers, 0.5);
+        assert_eq!(unet.working_scale(Some(0.3)), 1.0);
+    }
+
+    #[test]
+    fn masks_of_twice_the_size_are_put_where_the_photo_shows_them() {
+        let Some(unet) = open(&fixture("double_size.onnx")) else { return };
+        let unet = unet.unwrap();
+        let centers = lattice(20.2, 15.6, 5, 4);
+        assert_found(&unet.detect(&picture(170, 100, &centers), None).unwrap(), &centers, 0.2);
+    }
+
+    #[test]
+    fn a_photo_outside_of_the_liked_distances_is_scaled_and_its_boxes_are_not() {
+        let Some(unet) = open(&fixture("double_size.onnx")) else { return };
+        let unet = unet.unwrap();
+        assert_eq!(unet.working_scale(Some(0.03)), 1.0);
+        assert_eq!(unet.working_scale(None), 1.0);
+        assert_eq!(unet.working_scale(Some(f64::NAN)), 1.0);
+        let centers = lattice(20.2, 15.6, 5, 4);
+        for gsd_m in [0.023, 0.1] {
+            assert!(unet.working_scale(Some(gsd_m)) != 1.0);
+            assert_found(&unet.detect(&picture(170, 100, &centers), Some(gsd_m)).unwrap(), &centers, 0.3);
+        }
+    }
+
+    #[test]
+    fn a_photo_of_many_tiles_has_each_module_once() {
+        let Some(unet) = open(&fixture("double_size.onnx")) else { return };
+        let centers = lattice(20.2, 15.6, 52, 3);
+        let found = unet.unwrap().detect(&picture(1460, 75, &centers), None).unwrap();
+        assert_found(&found, &centers, 0.2);
+        let Some(fixed) = open(&fixture("fixed_size.onnx")) else { return };
+        let found = fixed.unwrap().detect(&picture(1460, 75, &centers), None).unwrap();
+        assert_found(&found, &centers, 0.5);
+    }
+
+    #[test]
+    fn modules_cut_by_the_frame_are_left_out() {
+        let Some(unet) = open(&fixture("double_size.onnx")) else { return };
+        let centers = lattice(11.9, 30.0, 4, 2);
+        let found = unet.unwrap().detect(&picture(118, 70, &centers), None).unwrap();
+        assert_found(&found, &centers, 0.2);
+        let Some(unet) = open(&fixture("double_size.onnx")) else { return };
+        let mut cut = lattice(5.0, 30.0, 4, 2);
+        let photo = picture(118, 70, &cut);
+        cut.retain(|(x, _)| *x > 12.0);
+        assert_found(&unet.unwrap().detect(&photo, None).unwrap(), &cut, 0.2);
+    }
+
+    #[test]
+    fn a_network_that_gives_no_numbers_is_an_error() {
+        let Some(unet) = open(&fixture("nan.onnx")) else { return };
+        let unet = unet.unwrap();
+        let centers = lattice(20.0, 15.0, 4, 3);
+        let error = unet.detect(&picture(150, 90, &centers), None).unwrap_err();
+        assert!(matches!(error, DetectionError::NotFinite { .. }), "{error}");
+        // A single pixel counts as nought.
+        let mut photo = RgbImage::from_pixel(150, 90, Rgb([90; 3]));
+        photo.put_pixel(70, 40, Rgb([0; 3]));
+        assert!(unet.detect(&photo, None).is_ok());
+    }
+
+    #[test]
+    fn photos_of_a_few_pixels_have_no_modules() {
+        let Some(unet) = open(&fixture("one_channel.onnx")) else { return };
+        let unet = unet.unwrap();
+        for (width, height) in [(0, 0), (1, 1), (1, 200), (3, 2)] {
+            assert!(unet.detect(&RgbImage::new(width, height), Some(0.5)).unwrap().is_empty());
+        }
+    }
+
+    #[test]
+    fn models_that_do_not_fit_are_refused_with_the_reason() {
+        for (name, code, words) in [
+            ("unnamed_channels.onnx", "model_unfit", "2 channels and no metadata"),
+            ("wrong_count.onnx", "model_unfit", "names 1 channels, but it has 2"),
+            ("no_module.onnx", "model_unfit", "(core, edge) is `module`"),
+            ("bad_shrink.onnx", "model_unfit", "`heliomap.core_shrink` is `nan`"),
+            ("other_kind.onnx", "model_unfit", "calls itself `yolo`"),
+            ("logits.onnx", "model_unfit", "with a sigmoid"),
+            ("classifier.onnx", "model_unfit", "masks of 1 x 1"),
+            ("grey.onnx", "model_unfit", "float32 [N, 3, H, W] is needed"),
+            ("two_inputs.onnx", "model_unfit", "one is needed"),
+            ("missing.onnx", "model_unreadable", "cannot be read"),
+        ] {
+            let Some(opened) = open(&fixture(name)) else { return };
+            let error = opened.err().unwrap_or_else(|| panic!("{name} was accepted"));
+            assert_eq!(error.code(), code, "{error}");
+            let text = error.to_string();
+            assert!(text.contains(name) && text.contains(words), "{text}");
+        }
+    }
+
+    #[test]
+    fn files_that_are_no_models_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let whole = std::fs::read(fixture("one_channel.onnx")).unwrap();
+        let noise: Vec<u8> = (0..4000_u32).map(|i| (i * i % 251) as u8).collect();
+        let contents: [(&str, &[u8]); 4] = [
+            ("empty.onnx", b""),
+            ("text.onnx", b"This is no model, but a letter.\n"),
+            ("noise.onnx", &noise),
+            ("cut.onnx", &whole[..whole.len() / 2]),
+        ];
+        for (name, bytes) in contents {
+            let path = folder.path().join(name);
+            std::fs::write(&path, bytes).unwrap();
+            let Some(opened) = open(&path) else { return };
+            let error = opened.err().unwrap_or_else(|| panic!("{name} was accepted"));
+            assert!(matches!(error, DetectionError::NotAModel { .. }), "{error}");
+            assert!(error.to_string().contains(name), "{error}");
+        }
+        let Some(opened) = open(folder.path()) else { return };
+        assert!(matches!(opened, Err(DetectionError::NotAModel { .. })));
+    }
+
+    #[test]
+    fn the_shipped_model_opens_and_sees_nothing_on_bare_ground() {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("models/unet.onnx");
+        let Some(unet) = open(&path) else { return };
+        let unet = unet.unwrap();
+        assert!(unet.describe().contains("unet.onnx"));
+        assert!(unet.core.is_some() && unet.gsd_m.is_some());
+        let ground = RgbImage::from_fn(320, 200, |x, y| {
+            let grain = (x.wrapping_mul(7919) ^ y.wrapping_mul(104_729)) % 17;
+            Rgb([120 + grain as u8, 110 + grain as u8, 80 + grain as u8])
+        });
+        assert!(unet.detect(&ground, Some(0.04)).unwrap().is_empty());
+    }
+
+    #[test]
+    fn tiles_keep_every_pixel_once_away_from_seams() {
+        for (length, fixed) in
+            [(1, None), (31, None), (1408, None), (1409, None), (1500, None), (2736, None), (30_000, None)]
+                .into_iter()
+                .chain([(50, Some(96)), (97, Some(96)), (1460, Some(96)), (5000, Some(640))])
+        {
+            let tiles = tiles(length, fixed);
+            let mut next = 0;
+            for (index, tile) in tiles.iter().enumerate() {
+                assert_eq!(tile.kept.start, next);
+                next = tile.kept.end;
+                assert_eq!(tile.size, tiles[0].size);
+                match fixed {
+                    Some(size) => assert_eq!(tile.size, size as usize),
+                    None => assert!(tile.size % STRIDE == 0 && tile.size <= TILE),
+                }
+                let margin = MARGIN.min(fixed.map_or(TILE, |size| size as usize) / 8);
+                assert!(tile.start <= tile.kept.start && tile.kept.end <= tile.start + tile.size);
+                assert!(index == 0 || tile.kept.start - tile.start >= margin);
+                assert!(index + 1 == tiles.len() || tile.start + tile.size - tile.kept.end >= margin);
+            }
+            assert_eq!(next, length);
+        }
+    }
+
+    #[test]
+    fn beyond_the_edge_the_image_is_mirrored() {
+        let seen: Vec<usize> = (0..9).map(|index| mirrored(index, 4)).collect();
+        assert_eq!(seen, [0, 1, 2, 3, 2, 1, 0, 1, 2]);
+        assert_eq!(mirrored(7, 1), 0);
+    }
+}
