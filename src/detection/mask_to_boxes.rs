@@ -44,7 +44,7 @@ const FAINT: (f64, f64) = (0.4, 1.6);
 /// How far the averaging over neighbours reaches (standard deviation), in module sizes.
 const REACH: f64 = 2.0;
 /// Neighbours of about the same size share their shape: standard deviation of the logarithm of sizes.
-const SIZE_SIGMA: f64 = 0.25;
+const SIZE_SIGMA: f64 = 0.35;
 /// Weights beyond this many standard deviations are taken as nought.
 const CUTOFF: f64 = 4.0;
 
