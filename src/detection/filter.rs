@@ -92,3 +92,43 @@ pub fn is_inside_frame(corners: &[Vector2<f64>; 4], width: u32, height: u32) -> 
         .iter()
         .all(|c| (-0.5..=f64::from(width) - 0.5).contains(&c.x) && (-0.5..=f64::from(height) - 0.5).contains(&c.y))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn upright(x: f64, y: f64, score: f32) -> ModuleBox {
+        ModuleBox { center: Vector2::new(x, y), u: Vector2::new(20.0, 0.0), v: Vector2::new(0.0, 10.0), score }
+    }
+
+    #[test]
+    fn of_two_boxes_that_overlap_the_better_stays() {
+        let kept = without_overlaps(vec![upright(0.0, 0.0, 0.8), upright(10.0, 0.0, 0.9), upright(27.0, 0.0, 0.7)]);
+        let places: Vec<f64> = kept.iter().map(|b| b.center.x).collect();
+        assert_eq!(places, [10.0, 27.0]);
+    }
+
+    #[test]
+    fn a_weak_box_needs_a_neighbour_in_the_lattice() {
+        let module = ProbabilityMap::from_fn(200, 100, |_, _| 1.0);
+        let boxes = vec![
+            upright(20.0, 20.0, 0.6),
+            upright(40.4, 20.0, 0.6),
+            // Beside the lattice.
+            upright(48.0, 50.0, 0.6),
+            upright(120.0, 50.0, 0.95),
+        ];
+        let mut places: Vec<f64> = plausible(boxes, &module).iter().map(|b| b.center.x).collect();
+        places.sort_by(f64::total_cmp);
+        assert_eq!(places, [20.0, 40.4, 120.0]);
+    }
+
+    #[test]
+    fn the_frame_cuts_what_reaches_out_of_it() {
+        let inside = |x: f64, y: f64| is_inside_frame(&upright(x, y, 1.0).quad().corners, 100, 50);
+        assert!(inside(9.5, 4.5));
+        assert!(!inside(9.4, 4.5));
+        assert!(inside(89.5, 44.5));
+        assert!(!inside(89.5, 44.6));
+    }
+}

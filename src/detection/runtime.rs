@@ -9,7 +9,7 @@ use std::ffi::OsString;
 use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
-use std::sync::Mutex;
+use std::sync::{Condvar, Mutex, PoisonError};
 
 /// The largest model file that is read.
 pub const MAX_MODEL_BYTES: u64 = 512 << 20;
@@ -22,7 +22,7 @@ static ENVIRONMENT: Mutex<Option<Environment>> = Mutex::new(None);
 /// The process's ONNX Runtime; loaded at the first call. A failure is not remembered: the library may be installed
 /// while the process runs.
 fn environment() -> Result<Environment, DetectionError> {
-    let mut slot = ENVIRONMENT.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    let mut slot = ENVIRONMENT.lock().unwrap_or_else(PoisonError::into_inner);
     if let Some(environment) = slot.as_ref() {
         return Ok(environment.clone());
     }
@@ -80,9 +80,52 @@ fn find_library(
     Ok(found.unwrap_or_else(|| PathBuf::from(system_name())))
 }
 
+/// The most sessions of one model: each keeps memory for a tile.
+const MAX_SESSIONS: usize = 4;
+
+/// Sessions of one model. Tiles run side by side, each on few threads, rather than one after the other on all: threads that
+/// share one tile wait for each other, the more so on a busy machine.
+pub(super) struct Sessions {
+    idle: Mutex<Vec<Session>>,
+    returned: Condvar,
+    count: usize,
+}
+
+impl Sessions {
+    /// How many calls of [`Self::with`] run at once.
+    pub fn count(&self) -> usize {
+        self.count
+    }
+
+    /// Lends a session to `f`, after waiting for one where all are in use. `f` must not wait for work that itself needs a
+    /// session.
+    pub fn with<T>(&self, f: impl FnOnce(&mut Session) -> T) -> T {
+        /// Gives the session back, also when `f` panics.
+        struct Lent<'a>(&'a Sessions, Option<Session>);
+        impl Drop for Lent<'_> {
+            fn drop(&mut self) {
+                if let Some(session) = self.1.take() {
+                    self.0.idle.lock().unwrap_or_else(PoisonError::into_inner).push(session);
+                    self.0.returned.notify_one();
+                }
+            }
+        }
+        let mut idle = self.idle.lock().unwrap_or_else(PoisonError::into_inner);
+        let session = loop {
+            match idle.pop() {
+                Some(session) => break session,
+                None => idle = self.returned.wait(idle).unwrap_or_else(PoisonError::into_inner),
+            }
+        };
+        drop(idle);
+        let mut lent = Lent(self, Some(session));
+        f(lent.1.as_mut().expect("taken in drop only"))
+    }
+}
+
 /// What a segmentation model of one image input and one mask output declares about itself.
 pub(super) struct SegmentationModel {
-    pub session: Session,
+    pub sessions: Sessions,
     pub input: String,
     pub output: String,
     /// Height and width that the input is bound to, where it is.
@@ -93,7 +136,7 @@ pub(super) struct SegmentationModel {
     pub digest: String,
 }
 
-/// Reads a model file and opens it with `threads` threads (0: one per core), on one float32 input `[N, 3, H, W]` and one
+/// Reads a model file and opens it with `threads` threads, on one float32 input `[N, 3, H, W]` and one
 /// float32 output `[N, C, sH, sW]`.
 ///
 /// # Errors
@@ -105,7 +148,11 @@ pub(super) fn open_segmentation(path: &Path, threads: usize) -> Result<Segmentat
     if bytes.is_empty() {
         return Err(no_model("the file is empty".to_owned()));
     }
-    let session = open_session(&bytes, threads, &name)?;
+    let threads = threads.max(1);
+    let count = threads.min(MAX_SESSIONS);
+    let sessions: Vec<Session> =
+        (0..count).map(|_| open_session(&bytes, threads / count, &name)).collect::<Result<_, _>>()?;
+    let session = &sessions[0];
     let unfit = |what: String| DetectionError::UnfitModel { name: name.clone(), what };
     let shape_of = |outlet: &ort::value::Outlet| -> Option<Vec<i64>> {
         let dtype = outlet.dtype();
@@ -159,7 +206,7 @@ pub(super) fn open_segmentation(path: &Path, threads: usize) -> Result<Segmentat
         fixed_size,
         metadata,
         digest: hexadecimal(&<sha2::Sha256 as sha2::Digest>::digest(&bytes)),
-        session,
+        sessions: Sessions { idle: Mutex::new(sessions), returned: Condvar::new(), count },
     })
 }
 
@@ -185,12 +232,14 @@ fn read_bounded(path: &Path, name: &str) -> Result<Vec<u8>, DetectionError> {
 fn open_session(bytes: &[u8], threads: usize, name: &str) -> Result<Session, DetectionError> {
     let environment = environment()?;
     let no_model = |what: &str| DetectionError::NotAModel { name: name.to_owned(), what: first_line(what) };
-    let threads = if threads == 0 { available_threads() } else { threads };
-    let mut builder = Session::builder(&environment)
-        .map_err(|error| DetectionError::Inference { what: error.to_string() })?
-        .with_optimization_level(GraphOptimizationLevel::All)
-        .and_then(|builder| builder.with_intra_threads(threads))
-        .map_err(|error| DetectionError::Inference { what: error.to_string() })?;
+    let options = || -> ort::Result<_> {
+        Ok(Session::builder(&environment)?
+            .with_optimization_level(GraphOptimizationLevel::All)?
+            .with_intra_threads(threads)?
+            // Threads that spin while they wait take the cores from decoding and post-processing.
+            .with_intra_op_spinning(false)?)
+    };
+    let mut builder = options().map_err(|error| DetectionError::Inference { what: error.message().to_owned() })?;
     builder.commit_from_memory(bytes).map_err(|error| no_model(error.message()))
 }
 
