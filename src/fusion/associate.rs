@@ -220,6 +220,16 @@ fn overlapping_pairs(pieces: &[LocatedPiece], options: &FusionOptions) -> Vec<Pa
     near.par_iter().filter_map(|&(a, b)| pair(a, b, pieces, options)).collect()
 }
 
+/// Where one cell of a piece stands in the lattice of another.
+struct Shift {
+    /// Columns and rows by which it stands outside the other piece.
+    outside: f64,
+    /// Its column and row there less its own.
+    col: f64,
+    row: f64,
+    at_m: Vector2<f64>,
+}
+
 /// The shifts that are possible between two pieces, or `None` if there is none.
 fn pair(a: usize, b: usize, pieces: &[LocatedPiece], options: &FusionOptions) -> Option<Pair> {
     let (first, second) = (&pieces[a], &pieces[b]);
@@ -235,33 +245,33 @@ fn pair(a: usize, b: usize, pieces: &[LocatedPiece], options: &FusionOptions) ->
         return None;
     }
     // Where the lattice of `a` lies in that of `b`, at the cells of `a` nearest to the middle of what they share.
-    let mut shifts: Vec<(f64, f64, f64, Vector2<f64>)> = Vec::new();
+    let mut shifts: Vec<Shift> = Vec::new();
     let stride = (first.cells.len() / 24).max(1);
     for cell in first.cells.iter().step_by(stride) {
         let Some(at) = second.ground.coordinate(cell.position_m.xy()) else { continue };
         let outside_col = (-at.x).max(at.x - f64::from(second.cols - 1)).max(0.0);
         let outside_row = (-at.y).max(at.y - f64::from(second.rows - 1)).max(0.0);
-        shifts.push((
-            outside_col + outside_row,
-            at.x - f64::from(cell.col),
-            at.y - f64::from(cell.row),
-            cell.position_m.xy(),
-        ));
+        shifts.push(Shift {
+            outside: outside_col + outside_row,
+            col: at.x - f64::from(cell.col),
+            row: at.y - f64::from(cell.row),
+            at_m: cell.position_m.xy(),
+        });
     }
-    shifts.sort_by(|p, q| p.0.total_cmp(&q.0));
-    let nearest = shifts.first()?.0;
+    shifts.sort_by(|p, q| p.outside.total_cmp(&q.outside));
+    let nearest = shifts.first()?.outside;
     let reach = options.max_disparity_m / other_u.norm().min(other_v.norm()) + 0.5;
     if nearest > reach {
         return None;
     }
-    shifts.retain(|shift| shift.0 <= nearest + 0.5);
-    let median = |f: fn(&(f64, f64, f64, Vector2<f64>)) -> f64| {
+    shifts.retain(|shift| shift.outside <= nearest + 0.5);
+    let median = |f: fn(&Shift) -> f64| {
         let mut values: Vec<f64> = shifts.iter().map(f).collect();
         values.sort_by(f64::total_cmp);
         values[values.len() / 2]
     };
-    let (col_shift, row_shift) = (median(|s| s.1), median(|s| s.2));
-    let at_m = shifts.iter().map(|s| s.3).sum::<Vector2<f64>>() / shifts.len() as f64;
+    let (col_shift, row_shift) = (median(|s| s.col), median(|s| s.row));
+    let at_m = shifts.iter().map(|s| s.at_m).sum::<Vector2<f64>>() / shifts.len() as f64;
     let (col_reach, row_reach) =
         (options.max_disparity_m / other_u.norm(), (options.max_disparity_m / other_v.norm()).max(0.5));
     let mut hypotheses = Vec::new();
@@ -322,12 +332,15 @@ fn structure_cost(a: &LocatedPiece, b: &LocatedPiece, col: i32, row: i32, option
     Some(cost)
 }
 
+/// A place, and what is left of the disparity there, metres.
+type Residual = (Vector2<f64>, Vector2<f64>);
+
 /// How the positions of two views disagree: one displacement for each view, and nearby pairs of the same two views.
 struct DisparityField {
     offset_m: Vec<Vector2<f64>>,
     sigma_m: f64,
     /// Residual disparities of sure pairs for each pair of views.
-    local: BTreeMap<(usize, usize), Vec<(Vector2<f64>, Vector2<f64>)>>,
+    local: BTreeMap<(usize, usize), Vec<Residual>>,
 }
 
 impl DisparityField {
@@ -358,9 +371,9 @@ impl DisparityField {
         }
         let mut spread = PRIOR_SIGMA_M;
         for _ in 0..30 {
-            for view in 0..views {
+            for (view, sure_of_view) in of_view.iter().enumerate() {
                 let (mut sum, mut weight) = (Vector2::zeros(), 0.5);
-                for &k in &of_view[view] {
+                for &k in sure_of_view {
                     let (a, b, _, disparity) = sure[k];
                     let target = if b == view { field.offset_m[a] + disparity } else { field.offset_m[b] - disparity };
                     let robust = 1.0 / (1.0 + ((target - field.offset_m[view]).norm() / spread).powi(2));

@@ -113,10 +113,8 @@ fn assemble_bench(
                 || (r >= piece.rows && piece.south == End::Closed);
             // Only next to the piece is it sure to be in the image.
             let near = (-1..=piece.cols).contains(&c) && (-1..=piece.rows).contains(&r);
-            if beyond && near {
-                if let Some(entry) = votes.get_mut(&(row, col)) {
-                    entry.absent.insert(piece.view);
-                }
+            if let Some(entry) = votes.get_mut(&(row, col)).filter(|_| beyond && near) {
+                entry.absent.insert(piece.view);
             }
         }
     }

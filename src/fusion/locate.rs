@@ -176,9 +176,12 @@ struct DepthSample {
     weight: f64,
 }
 
+/// What the cloud says at each cell of a piece, metres.
+type CloudAtCells = Vec<Option<Vector3<f64>>>;
+
 fn locate_view(view_index: usize, view: &View<'_>, cloud: &CloudIndex<'_>, radius_m: f64) -> Vec<LocatedPiece> {
     let (camera, pose) = (&view.shot.camera, &view.shot.pose);
-    let sampled: Vec<(Vec<DepthSample>, Vec<Option<Vector3<f64>>>)> = view
+    let sampled: Vec<(Vec<DepthSample>, CloudAtCells)> = view
         .layout
         .pieces
         .iter()

@@ -6,7 +6,6 @@ use heliomap::refinement::{self, Method, RefinedBench, RefinementOptions};
 use heliomap::simulator::{
     Errors, Flight, FoundModule, LayoutKind, PlantSpec, Simulation, StructureReport, simulate, structure_report,
 };
-use nalgebra::Vector3;
 use rand::SeedableRng;
 use rand::rngs::StdRng;
 
