@@ -276,7 +276,8 @@ impl App {
     /// Follows a job until it is as wanted.
     pub async fn follow_until(&self, job: &Value, wanted: impl Fn(&Value) -> bool) -> Value {
         let path = job_path(job);
-        for _ in 0..2000 {
+        // Two minutes at the most: a busy machine is no failure.
+        for _ in 0..24_000 {
             let (_, job) = self.get(&path).await;
             if wanted(&job) {
                 return job;
