@@ -4,7 +4,7 @@
 use super::mask_to_boxes::{ModuleBox, middle};
 use super::neighbours::Grid;
 use super::probability::ProbabilityMap;
-use nalgebra::{Matrix2, Vector2};
+use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
 
 /// Least mean `module` inside a box.
 const MODULE: f64 = 0.5;
@@ -16,6 +16,12 @@ const OVERLAP: f64 = 0.2;
 const ALONE: f32 = 0.9;
 /// Tolerance of a neighbour's place, in modules.
 const LATTICE: f64 = 0.2;
+/// Difference of the logarithm of a box's area to the usual there, from which it is odd.
+const ODD: f64 = 0.25;
+/// Difference of the logarithms of areas, up to which boxes are alike.
+const ALIKE: f64 = 0.25;
+/// Odd boxes in a group of more than this many are modules of another size.
+const FEW: usize = 4;
 /// Pitch of neighbours, in modules.
 const PITCH: f64 = 1.02;
 
@@ -28,9 +34,95 @@ pub fn plausible(boxes: Vec<ModuleBox>, module: &ProbabilityMap) -> Vec<ModuleBo
         .filter(|b| (SIZE.0 * representative..SIZE.1 * representative).contains(&b.area_px2()))
         .filter(|b| inside_mean(module, b) > MODULE)
         .collect();
-    let apart = without_overlaps(sized);
+    let apart = without_overlaps(mend_odd_ones(sized));
     let neighbours = lattice_neighbours(&apart);
-    apart.into_iter().zip(neighbours).filter(|(b, count)| *count > 0 || b.score > ALONE).map(|(b, _)| b).collect()
+    apart.into_iter().zip(neighbours).filter(|(b, near)| !near.is_empty() || b.score > ALONE).map(|(b, _)| b).collect()
+}
+
+/// An odd box that stands in the lattice of others takes their shape; one that does not is dropped.
+fn mend_odd_ones(mut boxes: Vec<ModuleBox>) -> Vec<ModuleBox> {
+    let neighbours = lattice_neighbours(&boxes);
+    let odd = odd_ones(&boxes, &neighbours);
+    let mut shapes: Vec<Vec<ModuleBox>> = vec![Vec::new(); boxes.len()];
+    for (index, near) in neighbours.iter().enumerate().filter(|(index, _)| !odd[*index]) {
+        for &other in near.iter().filter(|other| odd[**other]) {
+            shapes[other].push(boxes[index]);
+        }
+    }
+    for (b, shapes) in boxes.iter_mut().zip(&shapes) {
+        let Some(first) = shapes.first() else { continue };
+        // Opposite edge vectors mean the same.
+        let along = |a: Vector2<f64>, b: Vector2<f64>| if a.dot(&b) < 0.0 { -a } else { a };
+        b.u = shapes.iter().map(|shape| along(shape.u, first.u)).sum::<Vector2<f64>>() / shapes.len() as f64;
+        b.v = shapes.iter().map(|shape| along(shape.v, first.v)).sum::<Vector2<f64>>() / shapes.len() as f64;
+    }
+    boxes
+        .into_iter()
+        .zip(odd)
+        .zip(shapes)
+        .filter(|((_, odd), shapes)| !odd || !shapes.is_empty())
+        .map(|((b, _), _)| b)
+        .collect()
+}
+
+/// Which boxes are unlike the size that modules have there, and in no group of their like. The size may change over the
+/// image, as it does in perspective, and a plant may have modules of several sizes: these stand in benches.
+fn odd_ones(boxes: &[ModuleBox], neighbours: &[Vec<usize>]) -> Vec<bool> {
+    let sizes: Vec<f64> = boxes.iter().map(|b| b.area_px2().ln()).collect();
+    let expected = plane_through(&boxes.iter().map(|b| b.center).collect::<Vec<_>>(), &sizes);
+    let alike = |a: usize, b: usize| (sizes[a] - sizes[b]).abs() < ALIKE;
+    (0..boxes.len())
+        .map(|index| {
+            if (sizes[index] - expected[index]).abs() < ODD {
+                return false;
+            }
+            // The group of those alike, as far as it takes to know that it is large.
+            let mut group = vec![index];
+            let mut next = 0;
+            while next < group.len() && group.len() <= FEW {
+                let member = group[next];
+                for &other in &neighbours[member] {
+                    if alike(member, other) && neighbours[other].contains(&member) && !group.contains(&other) {
+                        group.push(other);
+                    }
+                }
+                next += 1;
+            }
+            group.len() <= FEW
+        })
+        .collect()
+}
+
+/// The values at the points of the plane that most of `values` lie close to (least squares, with weights that fall beyond
+/// a tenth).
+fn plane_through(points: &[Vector2<f64>], values: &[f64]) -> Vec<f64> {
+    let mean = points.iter().sum::<Vector2<f64>>() / points.len().max(1) as f64;
+    let spread = points.iter().map(|p| (p - mean).norm()).fold(1.0, f64::max);
+    let rows: Vec<Vector3<f64>> = points
+        .iter()
+        .map(|p| {
+            let at = (p - mean) / spread;
+            Vector3::new(1.0, at.x, at.y)
+        })
+        .collect();
+    let mut sorted = values.to_vec();
+    sorted.sort_unstable_by(f64::total_cmp);
+    let mut plane = Vector3::new(sorted.get(sorted.len() / 2).copied().unwrap_or(0.0), 0.0, 0.0);
+    // Few points tell no slope.
+    for _ in 0..if points.len() < 12 { 0 } else { 15 } {
+        // Held down a little, lest it tilts towards a stray box far away.
+        let held = 0.05 * points.len() as f64;
+        let mut matrix = Matrix3::from_diagonal(&Vector3::new(1e-6, held, held));
+        let mut right = Vector3::zeros();
+        for (row, value) in rows.iter().zip(values) {
+            let weight = 1.0 / (1.0 + ((value - row.dot(&plane)) / 0.1).powi(2));
+            matrix += row * row.transpose() * weight;
+            right += row * (weight * value);
+        }
+        let Some(solution) = matrix.cholesky().map(|factors| factors.solve(&right)) else { break };
+        plane = solution;
+    }
+    rows.iter().map(|row| row.dot(&plane)).collect()
 }
 
 /// Mean probability on a grid of 5 x 5 points over the inner 70 % of the box; nought where all lie outside.
@@ -66,22 +158,23 @@ pub fn without_overlaps(mut boxes: Vec<ModuleBox>) -> Vec<ModuleBox> {
     boxes.into_iter().zip(kept).filter(|(_, kept)| *kept).map(|(b, _)| b).collect()
 }
 
-/// How many of its four neighbours in the lattice of modules each box has.
-fn lattice_neighbours(boxes: &[ModuleBox]) -> Vec<usize> {
+/// The boxes that stand where the lattice of modules has the four neighbours of each box.
+fn lattice_neighbours(boxes: &[ModuleBox]) -> Vec<Vec<usize>> {
     let longest = boxes.iter().map(|b| b.u.norm()).fold(0.0, f64::max);
     let grid = Grid::new(boxes.iter().map(|b| b.center).collect(), longest);
     boxes
         .iter()
         .map(|b| {
-            let Some(modules_from_px) = Matrix2::from_columns(&[b.u, b.v]).try_inverse() else { return 0 };
+            let Some(modules_from_px) = Matrix2::from_columns(&[b.u, b.v]).try_inverse() else { return Vec::new() };
             [b.u, -b.u, b.v, -b.v]
                 .into_iter()
-                .filter(|step| {
+                .flat_map(|step| {
                     let place = b.center + step * PITCH;
                     grid.within(place, LATTICE * (b.u.norm() + b.v.norm()))
-                        .any(|(other, _)| (modules_from_px * (boxes[other].center - place)).amax() < LATTICE)
+                        .map(|(other, _)| other)
+                        .filter(move |&other| (modules_from_px * (boxes[other].center - place)).amax() < LATTICE)
                 })
-                .count()
+                .collect()
         })
         .collect()
 }
@@ -121,6 +214,44 @@ mod tests {
         let mut places: Vec<f64> = plausible(boxes, &module).iter().map(|b| b.center.x).collect();
         places.sort_by(f64::total_cmp);
         assert_eq!(places, [20.0, 40.4, 120.0]);
+    }
+
+    /// A bench of 6 x 3 boxes with edges of `width` and `height` pixels.
+    fn bench(x: f64, y: f64, width: f64, height: f64) -> Vec<ModuleBox> {
+        (0..18)
+            .map(|i| ModuleBox {
+                center: Vector2::new(x + 1.02 * width * f64::from(i % 6), y + 1.02 * height * f64::from(i / 6)),
+                u: Vector2::new(width, 0.0),
+                v: Vector2::new(0.0, height),
+                score: 0.95,
+            })
+            .collect()
+    }
+
+    fn full() -> ProbabilityMap {
+        ProbabilityMap::from_fn(600, 400, |_, _| 1.0)
+    }
+
+    #[test]
+    fn modules_of_two_sizes_in_perspective_all_stay() {
+        let mut boxes = bench(30.0, 30.0, 20.0, 12.0);
+        boxes.extend(bench(30.0, 330.0, 27.0, 17.0));
+        boxes.extend(bench(300.0, 200.0, 12.0, 30.0));
+        let count = boxes.len();
+        assert_eq!(plausible(boxes, &full()).len(), count);
+    }
+
+    #[test]
+    fn an_odd_box_takes_the_shape_of_its_neighbours_or_goes() {
+        let mut boxes = bench(30.0, 30.0, 20.0, 12.0);
+        let place = boxes[7].center;
+        boxes[7].u *= 0.75;
+        boxes[7].u.y = 3.0;
+        boxes.push(ModuleBox { center: Vector2::new(400.0, 300.0), u: Vector2::new(30.0, 0.0), ..boxes[0] });
+        let kept = plausible(boxes, &full());
+        assert_eq!(kept.len(), 18);
+        let mended = kept.iter().find(|b| b.center == place).unwrap();
+        assert!((mended.u - Vector2::new(20.0, 0.0)).norm() < 1e-9);
     }
 
     #[test]
