@@ -233,10 +233,11 @@ pub fn map_folder(
 ) -> Result<Mapping, MapError> {
     options.check()?;
     let mut clock = Clock { observer, timings: Vec::new() };
-    let project = clock.stage(Stage::Read, || reconstruction::opensfm::read(folder, options.max_image_pixels))??;
+    let mut project =
+        clock.stage(Stage::Read, || reconstruction::opensfm::read(folder, options.max_image_pixels))??;
     let mut warnings: Vec<Warning> =
         project.notes.iter().map(|note| Warning::new(note.code, note.message.clone(), [])).collect();
-    let cloud = cloud_of(&project);
+    let cloud = cloud_of(&mut project);
     let gsd_m = ground_sampling_distances(&project.reconstruction.shots, &cloud);
 
     let seen = match boxes {
@@ -304,10 +305,11 @@ pub fn map_folder(
     Ok(Mapping { model, timings, photos, shots, detections, layouts, fused, refined })
 }
 
-/// The points that modules are located by: the dense cloud, or the sparse points where there is none.
-fn cloud_of(project: &Project) -> PointCloud {
-    match &project.reconstruction.dense {
-        Some(dense) => dense.clone(),
+/// The points that modules are located by: the dense cloud, taken out of the project, or the sparse points where there is
+/// none.
+fn cloud_of(project: &mut Project) -> PointCloud {
+    match project.reconstruction.dense.take() {
+        Some(dense) => dense,
         None => PointCloud {
             positions_m: project
                 .reconstruction
@@ -375,7 +377,7 @@ fn resolving_images(
         ));
     }
     let shots = &project.reconstruction.shots;
-    let left_out: Vec<usize> = (0..shots.len()).filter(|k| !chosen.contains(k)).collect();
+    let left_out: Vec<usize> = (0..shots.len()).filter(|k| gsd_m[*k].is_some_and(|gsd| gsd > limit)).collect();
     if !left_out.is_empty() {
         let coarsest = left_out.iter().filter_map(|k| gsd_m[*k]).fold(0.0, f64::max);
         warnings.push(Warning::new(

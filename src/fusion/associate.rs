@@ -82,7 +82,7 @@ impl Undecided {
     pub(super) fn describe(&self, views: &[View<'_>], pieces: &[LocatedPiece]) -> Doubt {
         let name = |piece: usize| views[pieces[piece].view].shot.name.clone();
         let at = pieces[self.a].middle();
-        let choices: Vec<String> = self.choices.iter().map(|shift| format!("{shift:+}")).collect();
+        let shifts = |name: fn(&i32) -> String| self.choices.iter().map(name).collect::<Vec<_>>().join(" or ");
         let message = match self.code {
             "bench_conflict" => format!(
                 "the bench at {:.1} m east, {:.1} m north is seen differently in {} and {}: by the structure their columns \
@@ -91,16 +91,16 @@ impl Undecided {
                 at.y,
                 name(self.a),
                 name(self.b),
-                choices.join(" or ")
+                shifts(|shift| format!("{shift:+}"))
             ),
             _ => format!(
-                "the bench at {:.1} m east, {:.1} m north shows no end in both {} and {}: its columns may be shifted by {} \
-                 between them (margin {:.1}); check the number of modules along its rows",
+                "the bench at {:.1} m east, {:.1} m north shows no end in both {} and {}: column 1 of what the first shows \
+                 may be column {} of the second (margin {:.1}); they are not joined, and what lies over the other is left out",
                 at.x,
                 at.y,
                 name(self.a),
                 name(self.b),
-                choices.join(" or "),
+                shifts(|shift| (1 + shift).to_string()),
                 self.margin
             ),
         };

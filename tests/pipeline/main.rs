@@ -3,6 +3,7 @@
 #[path = "../common/boxes.rs"]
 mod boxes;
 mod broken;
+mod data;
 mod survey;
 mod unusual;
 mod whole;

@@ -51,5 +51,39 @@ fn a_known_spacing_is_taken() {
     let survey = Survey::new();
     let said = survey.map(true, &["--spacing", "1.02,1.67", "--rows-per-bench", "2"]);
     assert_eq!(said.code, Some(0), "{}", said.stderr);
-    assert_eq!(survey.modules().len(), 434);
+    let modules = survey.modules();
+    assert_eq!(modules.len(), 434);
+    // Metres between neighbours of a row, on a sphere: right to a few millimetres over one module.
+    let mut spacing_m: Vec<f64> = modules
+        .windows(2)
+        .filter(|pair| pair[0]["properties"]["sector"] == pair[1]["properties"]["sector"])
+        .map(|pair| {
+            let at = |k: usize, axis: usize| pair[k]["properties"]["center"][axis].as_f64().unwrap();
+            let degree_m = 111_230.0;
+            let east = (at(1, 0) - at(0, 0)) * degree_m * at(0, 1).to_radians().cos();
+            let (north, up) = ((at(1, 1) - at(0, 1)) * degree_m, at(1, 2) - at(0, 2));
+            (east * east + north * north + up * up).sqrt()
+        })
+        .collect();
+    spacing_m.sort_by(f64::total_cmp);
+    let median = spacing_m[spacing_m.len() / 2];
+    // Without the option the reconstruction's own scale gives 1.015 m.
+    assert!((median - 1.02).abs() < 0.003, "{median}");
+}
+
+#[test]
+fn the_lattice_errs_by_less_than_a_quarter_of_the_paper_s_refinement() {
+    let survey = Survey::new();
+    let truth = format!("{EXAMPLE}/truth.json");
+    let [lattice, paper] = ["lattice", "paper"].map(|method| {
+        let said = survey.map(true, &["--refinement", method]);
+        assert_eq!(said.code, Some(0), "{}", said.stderr);
+        let plant = survey.path("../out/plant.geojson");
+        let said = heliomap(&["evaluate", plant.to_str().unwrap(), &truth, "--json", "-"]);
+        let evaluation: Value = serde_json::from_str(&said.stdout).unwrap();
+        ["horizontal", "vertical"].map(|axis| evaluation["after_similarity_fit"][axis]["median"].as_f64().unwrap())
+    });
+    for (axis, (lattice, paper)) in ["horizontal", "vertical"].iter().zip(lattice.iter().zip(&paper)) {
+        assert!(4.0 * lattice < *paper, "{axis}: {lattice} m by the lattice, {paper} m by the paper");
+    }
 }

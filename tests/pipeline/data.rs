@@ -1,0 +1,54 @@
+//! The larger data sets, where they are there: `HELIOMAP_DATA` names their folder.
+
+use crate::survey::{can_detect, heliomap};
+use serde_json::Value;
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+/// The folder of a data set; says so where it is absent.
+fn data(name: &str) -> Option<PathBuf> {
+    let folder = std::env::var_os("HELIOMAP_DATA").filter(|path| !path.is_empty()).map(|path| {
+        // `make` gives it relative to the package.
+        PathBuf::from(env!("CARGO_MANIFEST_DIR")).join(path).join(name)
+    });
+    let folder = folder.filter(|folder| folder.is_dir());
+    if folder.is_none() {
+        eprintln!("skipped: the data set {name} is not there (HELIOMAP_DATA names the folder that holds it)");
+    }
+    folder.filter(|_| can_detect())
+}
+
+#[test]
+fn the_plant_at_full_resolution_is_right_to_a_centimetre_and_a_half() {
+    let Some(folder) = data("small") else { return };
+    let out = tempfile::tempdir().unwrap();
+    let plant = out.path().join("plant.geojson");
+    let said = heliomap(&["map", folder.to_str().unwrap(), "--out", plant.to_str().unwrap()]);
+    assert_eq!(said.code, Some(0), "{}", said.stderr);
+    let truth = folder.join("truth.json");
+    let evaluated = ["evaluate", plant.to_str().unwrap(), truth.to_str().unwrap(), "--strict", "--json", "-"];
+    let said = heliomap(&evaluated);
+    assert_eq!(said.code, Some(0), "{}", said.stderr);
+    let evaluation: Value = serde_json::from_str(&said.stdout).unwrap();
+    let error_m = |axis: &str, number: &str| evaluation["after_similarity_fit"][axis][number].as_f64().unwrap();
+    assert!(error_m("horizontal", "median") <= 0.015, "{}", error_m("horizontal", "median"));
+    assert!(error_m("vertical", "median") <= 0.05, "{}", error_m("vertical", "median"));
+    assert!(error_m("horizontal", "max").max(error_m("vertical", "max")) <= 0.25);
+}
+
+#[test]
+fn a_real_plant_is_mapped_to_its_end_with_most_whole_benches_right() {
+    let Some(folder) = data("missouri-west") else { return };
+    let out = tempfile::tempdir().unwrap();
+    let plant = out.path().join("plant.geojson");
+    let said = heliomap(&["map", folder.to_str().unwrap(), "--out", plant.to_str().unwrap()]);
+    assert_eq!(said.code, Some(0), "{}", said.stderr);
+    let modules: Value = serde_json::from_slice(&std::fs::read(&plant).unwrap()).unwrap();
+    let mut benches: BTreeMap<&str, usize> = BTreeMap::new();
+    for module in modules["features"].as_array().unwrap() {
+        *benches.entry(module["properties"]["bench"].as_str().unwrap()).or_default() += 1;
+    }
+    // Ten benches of 54 columns and 3 rows were counted; half of them is the least that must come out.
+    let whole = benches.values().filter(|count| **count == 162).count();
+    assert!(whole >= 5, "{whole} benches of 162 modules: {benches:?}");
+}
