@@ -26,7 +26,9 @@ def arguments() -> argparse.Namespace:
     p = argparse.ArgumentParser(description=__doc__)
     p.add_argument("--out", type=Path, default=Path("runs/unet"), help="folder of checkpoints and the log")
     p.add_argument("--steps", type=int, default=5000, help="length of the learning-rate schedule")
-    p.add_argument("--minutes", type=float, default=0, help="stop after so many minutes (0: when the steps are done)")
+    p.add_argument(
+        "--minutes", type=float, default=0, help="end the schedule after so many minutes, if the steps do not end it first"
+    )
     p.add_argument("--batch", type=int, default=6)
     p.add_argument("--size", type=int, default=256, help="side of a crop in pixels")
     p.add_argument("--lr", type=float, default=2e-3)
@@ -42,9 +44,10 @@ def arguments() -> argparse.Namespace:
     return p.parse_args()
 
 
-def schedule(step: int, steps: int) -> float:
+def schedule(step: int, done: float) -> float:
+    """Share of the learning rate at a step when `done` (0..1) of the training is over."""
     warm = min(1.0, (step + 1) / 100)
-    return warm * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * min(1.0, step / steps))))
+    return warm * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * min(1.0, done))))
 
 
 def main() -> None:
@@ -57,14 +60,14 @@ def main() -> None:
     net = UNet(WIDTHS).to(device, memory_format=torch.channels_last)
     mean = UNet(WIDTHS).to(device)  # running average of the weights: what is exported
     opt = torch.optim.AdamW(net.parameters(), lr=a.lr, weight_decay=1e-3)
-    step = 0
+    step, before = 0, 0.0  # steps and seconds of earlier runs
     path = a.out / "checkpoint.pt"
     if path.exists():
         state = torch.load(path, map_location=device, weights_only=True)
         net.load_state_dict(state["net"])
         mean.load_state_dict(state["mean"])
         opt.load_state_dict(state["opt"])
-        step = state["step"]
+        step, before = state["step"], state.get("seconds", 0.0)
         print(f"resumed at step {step}", flush=True)
     elif a.init:
         state = torch.load(a.init, map_location=device, weights_only=True)
@@ -75,6 +78,7 @@ def main() -> None:
 
     def save() -> None:
         state = {"net": net.state_dict(), "mean": mean.state_dict(), "opt": opt.state_dict(), "step": step, "widths": WIDTHS}
+        state["seconds"] = before + time.time() - begun
         torch.save(state, path.with_suffix(".tmp"))
         os.replace(path.with_suffix(".tmp"), path)
 
@@ -99,8 +103,11 @@ def main() -> None:
     begun = saved = time.time()
     average, first = 0.0, step
     while step < a.steps and not stop:
+        over = (before + time.time() - begun) / (a.minutes * 60) if a.minutes else 0.0
+        if over >= 1.0:
+            break
         for g in opt.param_groups:
-            g["lr"] = a.lr * schedule(step, a.steps)
+            g["lr"] = a.lr * schedule(step, max(step / a.steps, over))
         x, y, w = (t.to(device) for t in next(loader))
         x = x.contiguous(memory_format=torch.channels_last)
         with torch.autocast(device.type, torch.bfloat16):
@@ -128,8 +135,6 @@ def main() -> None:
         if now - saved > a.save_every:
             save()
             saved = now
-        if a.minutes and now - begun > a.minutes * 60:
-            break
     save()
     print(f"stopped at step {step}", flush=True)
 
