@@ -154,9 +154,25 @@ class Style:
         self.broken = [rng.random() < 0.45, rng.random() < 0.45]
         self.streak = [rng.uniform(0.0, 0.06) if rng.random() < 0.35 else 0.0 for _ in range(2)]
         self.frame_fade = [1.0 if rng.random() < 0.55 else rng.uniform(0.0, 0.6) for _ in range(2)]
-        self.spot = rng.random() < 0.15  # a bright spot at module corners (clamps)
+        if kind in ("poly", "mono") and rng.random() < 0.3:
+            self.camouflage(rng)
         self.sheen = rng.uniform(-0.5, 0.7)
         self.glare = 0.5 if rng.random() < 0.3 else 0.0
+
+    def camouflage(self, rng: Rng):
+        """Cell grids brighter than all else; frames and seams narrow and dark, or of the grid's mean colour."""
+        self.cell_color = rgb(0.85, 0.87, 0.92) * rng.uniform(0.6, 1.2)
+        self.cell_gap = rng.uniform(0.004, 0.02)
+        self.bus_count = int(rng.choice([0, 0, 2, 3]))
+        share = min(0.5, 2 * self.cell_gap * self.cells[0] / self.size[0])
+        grid = self.color * (1 - share) + self.cell_color * share
+        self.frame_color = rgb(0.05, 0.05, 0.06) * rng.uniform(0.6, 2) if rng.random() < 0.6 else grid * rng.uniform(0.6, 1.1)
+        self.frame = rng.uniform(0.004, 0.03)
+        self.margin = rng.uniform(0.0, 0.012)
+        self.seam = (rng.uniform(0.002, 0.022), rng.uniform(0.002, 0.022))
+        self.seam_color = [rgb(0.05, 0.05, 0.06) * rng.uniform(0.6, 2) if rng.random() < 0.8 else grid for _ in range(2)]
+        self.streak = [0.0, 0.0]
+        self.frame_fade = [1.0 if rng.random() < 0.7 else rng.uniform(0.2, 1.0) for _ in range(2)]
 
     def footprint(self) -> tuple[float, float]:
         a, b = self.size
@@ -302,7 +318,7 @@ def bench_texture(s: Style, rng: Rng, cols: int, rows: int, texel: float):
         c, r = rng.uniform((0, 0), (length, height)), rng.uniform(0.7, 5, 2)
         d2 = ((xx - c[0]) / r[0]) ** 2 + ((yy - c[1]) / r[1]) ** 2
         g = np.exp(-(d2 ** rng.uniform(0.7, 3)) / 2) * rng.uniform(0.3, 3)
-        keep = rng.uniform(0.6, 1.0)
+        keep = rng.uniform(0.6, 1.0) if rng.random() < 0.6 else 1.0
         soft = 1 - (1 - keep) * union(np.clip(U[0] + U[2], 0, 1), np.clip(V[0] + V[2], 0, 1))
         tex = tex + (g * soft)[..., None] * rgb(1.0, rng.uniform(0.9, 1), rng.uniform(0.75, 1.0))
     # Missing modules leave a hole with rails.
@@ -365,6 +381,29 @@ def poly_mask(n: int, quads, blur: float = 0.0) -> np.ndarray:
     return cv2.GaussianBlur(m, (0, 0), blur) if blur > 0.3 else m
 
 
+def bench_shadow(rng: Rng, n: int, polys: list[np.ndarray], rows: int, pitch: float, texel: float, onto) -> np.ndarray:
+    """Shade 0..1 of benches whose seams let light through, broken here and there; `onto` takes world points to the canvas."""
+    shade = poly_mask(n, [onto(p) for p in polys])
+    light = np.zeros((n, n), np.uint8)
+    widths = [int(v) for v in rng.integers(1, 4, 2)]
+    axes = (rng.random() < 0.85, rng.random() < 0.5)
+    for p in polys:
+        cols = max(1, round(float(np.linalg.norm(p[1] - p[0])) / pitch))
+        f, g = np.arange(1, rows)[:, None] / rows, np.arange(1, cols)[:, None] / cols
+        along = np.stack([p[0] + (p[3] - p[0]) * f, p[1] + (p[2] - p[1]) * f], axis=1)
+        across = np.stack([p[0] + (p[1] - p[0]) * g, p[3] + (p[2] - p[3]) * g], axis=1)
+        for some, width, ends in zip(axes, widths, (along, across)):
+            if some and len(ends):
+                px = np.clip(np.round(onto(ends.reshape(-1, 3)) * 16), -(1 << 24), 1 << 24).astype(np.int32).reshape(-1, 2, 1, 2)
+                cv2.polylines(light, list(px), False, 255, width, cv2.LINE_AA, 4)
+    light = light.astype(np.float32) / 255 * rng.uniform(0.3, 1.0)
+    if rng.random() < 0.6:
+        light *= 1 / (1 + np.exp(-np.clip((noise_field(rng, n, rng.uniform(0.15, 1.0) / texel) + rng.normal(0, 0.5)) * rng.uniform(2, 10), -30, 30)))
+    shade = shade * (1 - light)
+    blur = rng.uniform(0.0, 1.5) * UP
+    return cv2.GaussianBlur(shade, (0, 0), blur) if blur > 0.3 else shade
+
+
 def draw(rng: Rng, size: int, short_side: tuple[float, float], empty: float = 0.06) -> tuple[np.ndarray, np.ndarray]:
     """One picture (size, size, 3) uint8 RGB and its modules' corners (n, 4, 2)."""
     style = Style(rng)
@@ -379,7 +418,7 @@ def draw(rng: Rng, size: int, short_side: tuple[float, float], empty: float = 0.
     axis = np.array([np.cos(theta), np.sin(theta), rng.normal(0, 0.02)])
     axis /= np.linalg.norm(axis)
     flat = np.array([-np.sin(theta), np.cos(theta), 0.0])
-    tilt = np.deg2rad(rng.uniform(0, 38) if rng.random() < 0.8 else 0.0)
+    tilt = np.deg2rad(rng.uniform(0, 38) if rng.random() < 0.75 else rng.choice([0.0, rng.uniform(38, 60)]))
     slope = np.cos(tilt) * flat + np.array([0, 0, np.sin(tilt)])
     mw, mh = style.footprint()
     rows = int(rng.choice([1, 2, 3, 4, 5, 6], p=[0.17, 0.27, 0.2, 0.18, 0.1, 0.08]))
@@ -489,12 +528,10 @@ def draw(rng: Rng, size: int, short_side: tuple[float, float], empty: float = 0.
             e = axis * nc * (mw + style.seam[0])
             u = slope * bench_h
             polys.append(np.array([o, o + e, o + e + u, o + u]))
-        if rng.random() < 0.5:
+        if rng.random() < 0.4:
             shadow([cam(onto_ground(p)) for p in polys])
-        else:  # light falls through the seams between the rows
-            f = np.arange(rows) / rows
-            g = f + (1 - style.seam[1] / (mh + style.seam[1])) / rows
-            shadow([cam(onto_ground(np.array([p[0] + (p[3] - p[0]) * a, p[1] + (p[2] - p[1]) * a, p[1] + (p[2] - p[1]) * b, p[0] + (p[3] - p[0]) * b]))) for p in polys for a, b in zip(f, g)])
+        else:  # light falls through the seams: a lattice on the ground that is none of modules
+            x *= 1 - bench_shadow(rng, n, polys, rows, mw + style.seam[0], texel, lambda p: cam(onto_ground(p)))[..., None] * (1 - dark * sky)
         if rng.random() < 0.4:  # posts, cables, cable trays
             color = rgb(1, 1, 1) * rng.uniform(0.1, 0.9)
             m = np.zeros((n, n), np.uint8)

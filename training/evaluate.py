@@ -155,7 +155,7 @@ def overlay(photo: Photo, found: list[Box], path: Path, truth: bool = True) -> N
 def test_sets() -> dict[str, list[tuple[Photo, float]]]:
     """Name of the set to its photos and the scale at which each is run."""
     sets: dict[str, list[tuple[Photo, float]]] = {}
-    for folder in sources.render_folders(test=True):
+    for folder in sources.render_folders("test"):
         sets[f"train/{folder.name}"] = [(p, working_scale(p.gsd)) for p in sources.load_render(folder)]
     example = sources.data_root() / "example"
     if (example / "truth.json").exists():

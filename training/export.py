@@ -1,6 +1,7 @@
 """Writes the ONNX model: `python -m training.export --checkpoint runs/unet/checkpoint.pt --out models/unet.onnx`.
 
-Checks that ONNX Runtime and PyTorch agree on several sizes, and writes what the service must know as metadata.
+Either network, as the checkpoint says. Checks that ONNX Runtime and PyTorch agree on several sizes, and writes what the
+service must know as metadata.
 """
 
 from __future__ import annotations
@@ -14,24 +15,47 @@ import numpy as np
 import onnx
 import onnxruntime as ort
 import torch
+from torch import nn
 
-from .net import CHANNELS, UNet, WithSigmoid
+from .net import CHANNELS, Decoded, Instances, UNet, WithSigmoid
 from .targets import CORE_SHRINK, GSD, GSD_RANGE
 
 TOLERANCE = 2e-3
+SIZES = ((1, 32, 32), (1, 256, 256), (2, 320, 192), (1, 928, 1376))
+
+
+def load(state: dict) -> tuple[nn.Module, str, dict[str, list[str]], dict[str, str]]:
+    """The network of a checkpoint as it is exported: with its input, its outputs with their axes, its metadata."""
+    widths = tuple(state["widths"])
+    if state.get("kind", "unet") == "unet":
+        net = UNet(widths)
+        net.load_state_dict(state["mean"])
+        meta = {"heliomap.kind": "unet", "heliomap.channels": ",".join(CHANNELS), "heliomap.core_shrink": str(CORE_SHRINK)}
+        return WithSigmoid(net).eval(), "image", {"masks": ["n", "", "h", "w"]}, meta
+    net = Instances(widths)
+    net.load_state_dict(state["mean"])
+    meta = {
+        "heliomap.kind": "yolo",
+        "heliomap.classes": "module",
+        "heliomap.strides": str(Instances.CELL),
+        "heliomap.nms": "mask",
+        "task": "segment",
+        "stride": "32",
+        "names": "{0: 'module'}",
+    }
+    return Decoded(net).eval(), "images", {"output0": ["n", "", "anchors"], "output1": ["n", "", "h4", "w4"]}, meta
 
 
 def main() -> None:
     p = argparse.ArgumentParser(description=__doc__)
     p.add_argument("--checkpoint", type=Path, default=Path("runs/unet/checkpoint.pt"))
     p.add_argument("--out", type=Path, default=Path("models/unet.onnx"))
-    p.add_argument("--version", default="0.1.0")
+    p.add_argument("--version", default="0.2.0")
     p.add_argument("--self-frames", type=int, default=0, help="self-labelled frames it was trained on (for the card)")
+    p.add_argument("--steps-before", type=int, default=0, help="steps of the weights that training started from (for the card)")
     a = p.parse_args()
     state = torch.load(a.checkpoint, map_location="cpu", weights_only=True)
-    net = UNet(tuple(state["widths"]))
-    net.load_state_dict(state["mean"])
-    model = WithSigmoid(net).eval()
+    model, name, outputs, meta = load(state)
     a.out.parent.mkdir(parents=True, exist_ok=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -39,41 +63,36 @@ def main() -> None:
             model,
             (torch.rand(1, 3, 64, 96),),
             str(a.out),
-            input_names=["image"],
-            output_names=["masks"],
-            dynamic_axes={"image": {0: "n", 2: "h", 3: "w"}, "masks": {0: "n", 2: "h", 3: "w"}},
+            input_names=[name],
+            output_names=list(outputs),
+            dynamic_axes={name: {0: "n", 2: "h", 3: "w"}} | {o: {i: x for i, x in enumerate(axes) if x} for o, axes in outputs.items()},
             opset_version=17,
             dynamo=False,
         )
     onnx_model = onnx.load(str(a.out))
     digest = hashlib.sha256(b"".join(t.raw_data for t in onnx_model.graph.initializer)).hexdigest()[:12]
-    onnx.helper.set_model_props(
-        onnx_model,
-        {
-            "heliomap.kind": "unet",
-            "heliomap.channels": ",".join(CHANNELS),
-            "heliomap.core_shrink": str(CORE_SHRINK),
-            "heliomap.gsd_m": str(GSD),
-            "heliomap.gsd_range_m": ",".join(str(v) for v in GSD_RANGE),
-            "heliomap.version": f"{a.version}+{digest}",
-            "heliomap.steps": str(state["step"]),
-            "heliomap.self_frames": str(a.self_frames),
-        },
-    )
+    meta |= {
+        "heliomap.gsd_m": str(GSD),
+        "heliomap.gsd_range_m": ",".join(str(v) for v in GSD_RANGE),
+        "heliomap.version": f"{a.version}+{digest}",
+        "heliomap.steps": str(a.steps_before + state["step"]),
+        "heliomap.self_frames": str(a.self_frames),
+    }
+    onnx.helper.set_model_props(onnx_model, meta)
     onnx.checker.check_model(onnx_model)
     onnx.save(onnx_model, str(a.out))
 
     session = ort.InferenceSession(str(a.out), providers=["CPUExecutionProvider"])
     rng = np.random.default_rng(1)
     worst = 0.0
-    for n, h, w in ((1, 32, 32), (1, 256, 256), (2, 320, 192), (1, 928, 1376)):
+    for n, h, w in SIZES:
         x = rng.random((n, 3, h, w), dtype=np.float32)
-        y = session.run(None, {"image": x})[0]
         with torch.inference_mode():
-            t = model(torch.from_numpy(x)).numpy()
-        assert y.shape == (n, len(CHANNELS), h, w), y.shape
-        assert 0.0 <= y.min() and y.max() <= 1.0
-        worst = max(worst, float(np.abs(y - t).max()))
+            theirs = model(torch.from_numpy(x))
+        for y, t in zip(session.run(None, {name: x}), theirs if isinstance(theirs, tuple) else (theirs,)):
+            t = t.numpy()
+            assert y.shape == t.shape and np.isfinite(y).all(), (y.shape, t.shape)
+            worst = max(worst, float((np.abs(y - t) / np.maximum(1.0, np.abs(t))).max()))
     print(f"{a.out}: {a.out.stat().st_size / 1e6:.2f} MB, largest difference to PyTorch {worst:.1e}")
     if worst > TOLERANCE:
         raise SystemExit("ONNX Runtime and PyTorch disagree")

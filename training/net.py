@@ -76,6 +76,96 @@ class UNet(nn.Module):
         return self.shuffle(self.head(x))
 
 
+class Instances(nn.Module):
+    """A one-class instance network with the outputs of YOLOv8-seg, on the U-Net's encoder and the first of its decoder.
+
+    One anchor per cell of 8 x 8 pixels. `forward` gives raw maps: `head` [N, 11 + P, H/8, W/8] and learned prototypes
+    [N, P, H/4, W/4]; `decode` turns them into what is exported. Convolutions cannot tell one module of a lattice from
+    the next by learned prototypes alone, so six more prototypes are fixed: 1, x, y, x^2, x y, y^2. Each anchor's head says
+    a quadratic form about its own centre, whose coefficients on these six follow by expansion.
+    """
+
+    CELL = 8
+    LEARNED = 26
+    FIXED = 6
+    FORM_SCALE = 64.0  # pixels: the unit of the fixed prototypes' coordinates
+
+    def __init__(self, widths: tuple[int, ...] = WIDTHS):
+        super().__init__()
+        w = widths
+        base = UNet(w)
+        self.stem, self.down = base.stem, base.down
+        self.up, self.dec = base.up[:-1], base.dec[:-1]
+        self.anchor = nn.Sequential(conv(w[2], w[2]), conv(w[2], w[2]))
+        # score; centre x, y; log w, h; quadratic form (3), linear (2), constant; coefficients of the learned prototypes
+        self.head = nn.Conv2d(w[2], 11 + self.LEARNED, 1)
+        self.proto = nn.Sequential(conv(w[1], w[1]), nn.Conv2d(w[1], self.LEARNED, 1))
+        nn.init.normal_(self.head.weight, std=0.01)
+        nn.init.zeros_(self.head.bias)
+        with torch.no_grad():
+            self.head.bias[0] = -3.0
+            self.head.bias[3:5] = 1.3
+            self.head.bias[10] = 2.0
+
+    def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        x = self.stem(x * 4.0 - 2.0)
+        skips = []
+        for d in self.down:
+            skips.append(x)
+            x = d(x)
+        levels = []
+        for up, dec, s in zip(self.up, self.dec, reversed(skips)):
+            x = dec(torch.relu(up(x) + s))
+            levels.append(x)
+        return self.head(self.anchor(levels[-2])), self.proto(levels[-1])
+
+    @classmethod
+    def decode(cls, head: torch.Tensor, proto: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Raw maps to `output0` [N, 37, A] and `output1` [N, 32, H/4, W/4], in float32.
+
+        Coordinates of the fixed prototypes are input pixels (corners at whole numbers) from the image's middle, in
+        units of FORM_SCALE.
+        """
+        n, _, h, w = head.shape
+        ys = (torch.arange(h, device=head.device, dtype=torch.float32) + 0.5) * cls.CELL
+        xs = (torch.arange(w, device=head.device, dtype=torch.float32) + 0.5) * cls.CELL
+        cy, cx = ys[None, :, None], xs[None, None, :]
+        head, proto = head.float(), proto.float()
+        bx, by = cx + head[:, 1] * cls.CELL, cy + head[:, 2] * cls.CELL
+        bw, bh = torch.exp(head[:, 3].clamp(-2, 4)) * cls.CELL, torch.exp(head[:, 4].clamp(-2, 4)) * cls.CELL
+        # -|L p|^2 with p from the predicted centre in units of 8 pixels, L lower triangular; plus linear and constant.
+        k = cls.FORM_SCALE / cls.CELL
+        a, b, c = torch.exp(head[:, 5].clamp(-4, 3)), head[:, 6], torch.exp(head[:, 7].clamp(-4, 3))
+        qxx, qxy, qyy = -(a * a + b * b) * k * k, -2 * b * c * k * k, -c * c * k * k
+        lx, ly, l0 = head[:, 8] * k, head[:, 9] * k, head[:, 10]
+        ox, oy = (bx - w * cls.CELL / 2) / cls.FORM_SCALE, (by - h * cls.CELL / 2) / cls.FORM_SCALE
+        fixed = [
+            l0 - lx * ox - ly * oy + qxx * ox * ox + qxy * ox * oy + qyy * oy * oy,
+            lx - 2 * qxx * ox - qxy * oy,
+            ly - 2 * qyy * oy - qxy * ox,
+            qxx,
+            qxy,
+            qyy,
+        ]
+        out0 = torch.cat([torch.stack([bx, by, bw, bh, torch.sigmoid(head[:, 0])], 1), head[:, 11:], torch.stack(fixed, 1)], 1)
+        py = ((torch.arange(2 * h, device=head.device, dtype=torch.float32) + 0.5) * 4 - h * cls.CELL / 2) / cls.FORM_SCALE
+        px = ((torch.arange(2 * w, device=head.device, dtype=torch.float32) + 0.5) * 4 - w * cls.CELL / 2) / cls.FORM_SCALE
+        gy, gx = torch.meshgrid(py, px, indexing="ij")
+        grid = torch.stack([torch.ones_like(gx), gx, gy, gx * gx, gx * gy, gy * gy])
+        return out0.flatten(2), torch.cat([proto, grid[None].expand(n, -1, -1, -1)], 1)
+
+
+class Decoded(nn.Module):
+    """What is exported of `Instances`."""
+
+    def __init__(self, net: Instances):
+        super().__init__()
+        self.net = net
+
+    def forward(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return self.net.decode(*self.net(images))
+
+
 class WithSigmoid(nn.Module):
     """What is exported: probabilities instead of logits."""
 

@@ -20,7 +20,7 @@ from .augment import crop
 
 class Crops(CalibrationDataReader):
     def __init__(self, count: int, seed: int = 0):
-        photos = [p for f in sources.render_folders(test=False)[::3] for p in sources.load_render(f)[:1]]
+        photos = [p for f in sources.render_folders("train")[::3] for p in sources.load_render(f)[:1]]
         photos += sources.real_frames(test=False)
         rng = np.random.default_rng(seed)
         crops = (crop(photos[i % len(photos)], 320, rng, (12.0, 36.0))[0] for i in range(count))

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 TEST_PLANTS = ("10", "11", "12", "13")
+VALIDATION_PLANTS = ("14", "19", "24", "29", "34", "39", "44", "49", "54", "59")
 TEST_FRAMES = ("tsukuba_vegetation.jpg",)
 
 
@@ -121,13 +122,15 @@ def real_frames(test: bool) -> list[Photo]:
     return load_labelled(folder, labels, names)
 
 
-def render_folders(test: bool) -> list[Path]:
+def render_folders(part: str) -> list[Path]:
+    """Folders of the rendered plants of a part: `train`, `validation` (thresholds are chosen there) or `test`."""
     folders = sorted(p for p in (data_root() / "train").iterdir() if (p / "truth.json").exists())
-    return [p for p in folders if (p.name in TEST_PLANTS) == test]
+    parts = {name: "test" for name in TEST_PLANTS} | {name: "validation" for name in VALIDATION_PLANTS}
+    return [p for p in folders if parts.get(p.name, "train") == part]
 
 
-def train_renders() -> list[Photo]:
-    return [photo for folder in render_folders(test=False) for photo in load_render(folder)]
+def renders(part: str) -> list[Photo]:
+    return [photo for folder in render_folders(part) for photo in load_render(folder)]
 
 
 def west_test() -> list[Photo]:

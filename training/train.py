@@ -92,7 +92,7 @@ def main() -> None:
     signal.signal(signal.SIGINT, on_signal)
 
     mix = [
-        (a.renders, sources.train_renders()),
+        (a.renders, sources.renders("train")),
         (a.real, sources.real_frames(test=False)),
         (a.own, sources.self_labelled(a.self_labels)),
     ]
