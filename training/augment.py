@@ -106,8 +106,10 @@ def photometric(image: np.ndarray, rng: Rng, strength: float = 1.0) -> np.ndarra
         x = gray + (x - gray) * np.float32(rng.uniform(0.4, 1.5) if strength > 0.5 else rng.uniform(0.8, 1.2))
         x = np.clip(x, 0, None) ** np.float32(np.exp(rng.normal(0, 0.22 * strength)))
         x = (x - 0.5) * np.float32(np.exp(rng.normal(0, 0.15))) + 0.5 + np.float32(rng.normal(0, 0.06))
+    if rng.random() < 0.12:  # a dark, flat exposure
+        x = x * np.float32(rng.uniform(0.25, 0.7)) + np.float32(rng.uniform(0.0, 0.12))
     if rng.random() < 0.35:
-        s = rng.uniform(0.3, 1.1)
+        s = rng.uniform(0.3, 1.3)
         x = cv2.GaussianBlur(x, (0, 0), s)
     elif rng.random() < 0.1:
         n = int(rng.integers(2, 5))

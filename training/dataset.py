@@ -15,6 +15,7 @@ from .sources import Photo
 from .targets import make_targets
 
 SHORT_SIDE = (9.0, 44.0)  # short side of a module in pixels
+HARDNESS = {"halfcut": 2.5, "poly": 1.5}  # how often photos of a style are taken, others once
 
 
 def dihedral(image: np.ndarray, quads: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
@@ -30,16 +31,22 @@ def dihedral(image: np.ndarray, quads: np.ndarray, k: int) -> tuple[np.ndarray, 
     return np.ascontiguousarray(image), q
 
 
+def shares(photos: list[Photo]) -> np.ndarray:
+    """Cumulative shares of photos in the samples: those of hard styles come more often."""
+    weight = np.cumsum([HARDNESS.get(p.conditions.get("style"), 1.0) for p in photos])
+    return weight / weight[-1]
+
+
 class Stream(IterableDataset):
-    """Yields image (3, s, s) float, target (2, s, s) and weight (2, s, s).
+    """Yields image (3, s, s) float and what `targets` makes of the modules' quadrilaterals.
 
     `sources` are (share, photos) pairs; what is left of 1 is drawn. Drawn pictures are used about twice, each time
     turned and finished differently.
     """
 
-    def __init__(self, sources: list[tuple[float, list[Photo]]], size: int, seed: int, start: int = 0):
-        self.sources = [(p, photos) for p, photos in sources if photos and p > 0]
-        self.size, self.seed, self.start = size, seed, start
+    def __init__(self, sources: list[tuple[float, list[Photo]]], size: int, seed: int, start: int = 0, targets=make_targets):
+        self.sources = [(p, photos, shares(photos)) for p, photos in sources if photos and p > 0]
+        self.size, self.seed, self.start, self.targets = size, seed, start, targets
 
     def __iter__(self):
         cv2.setNumThreads(0)
@@ -57,9 +64,9 @@ class Stream(IterableDataset):
 
     def sample(self, rng: np.random.Generator, recent: deque):
         r = rng.random()
-        for share, photos in self.sources:
+        for share, photos, hardness in self.sources:
             if r < share:
-                photo = photos[rng.integers(len(photos))]
+                photo = photos[np.searchsorted(hardness, rng.random())]
                 image, quads, ignore = crop(photo, self.size, rng, SHORT_SIDE)
                 image = photometric(image, rng, 1.0)
                 break
@@ -72,9 +79,5 @@ class Stream(IterableDataset):
                 image, quads = recent[rng.integers(len(recent))]
             image, quads = dihedral(image, quads, int(rng.integers(8)))
             image, ignore = photometric(image, rng, 0.6), []
-        target, weight = make_targets(quads, ignore, self.size)
-        return (
-            torch.from_numpy(image).permute(2, 0, 1).float().div_(255.0),
-            torch.from_numpy(target),
-            torch.from_numpy(weight),
-        )
+        made = self.targets(quads, ignore, self.size)
+        return (torch.from_numpy(image).permute(2, 0, 1).float().div_(255.0), *(torch.from_numpy(t) for t in made))

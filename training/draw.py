@@ -111,7 +111,9 @@ class Style:
             nx = self.cells[0]
             ny = int(round(nx * self.size[1] / self.size[0]))
             self.cells = (nx, ny)
-        self.halfcut = kind in ("mono", "black") and rng.random() < 0.45
+        self.halfcut = kind != "thin" and rng.random() < (0.2 if kind == "poly" else 0.5)
+        if self.halfcut:
+            self.cells = (self.cells[0], 2 * self.cells[1])
         base = {
             "poly": [rgb(0.14, 0.19, 0.42), rgb(0.22, 0.27, 0.46), rgb(0.20, 0.20, 0.36), rgb(0.28, 0.36, 0.62)],
             "mono": [rgb(0.10, 0.11, 0.18), rgb(0.16, 0.18, 0.27), rgb(0.22, 0.26, 0.36), rgb(0.10, 0.12, 0.14), rgb(0.22, 0.18, 0.27), rgb(0.30, 0.30, 0.33)],
@@ -154,7 +156,7 @@ class Style:
         self.broken = [rng.random() < 0.45, rng.random() < 0.45]
         self.streak = [rng.uniform(0.0, 0.06) if rng.random() < 0.35 else 0.0 for _ in range(2)]
         self.frame_fade = [1.0 if rng.random() < 0.55 else rng.uniform(0.0, 0.6) for _ in range(2)]
-        if kind in ("poly", "mono") and rng.random() < 0.3:
+        if kind != "thin" and rng.random() < 0.45:
             self.camouflage(rng)
         self.sheen = rng.uniform(-0.5, 0.7)
         self.glare = 0.5 if rng.random() < 0.3 else 0.0
@@ -162,11 +164,12 @@ class Style:
     def camouflage(self, rng: Rng):
         """Cell grids brighter than all else; frames and seams narrow and dark, or of the grid's mean colour."""
         self.cell_color = rgb(0.85, 0.87, 0.92) * rng.uniform(0.6, 1.2)
-        self.cell_gap = rng.uniform(0.004, 0.02)
+        self.cell_gap = rng.uniform(0.003, 0.016) * (0.7 if self.halfcut else 1.0)
         self.bus_count = int(rng.choice([0, 0, 2, 3]))
         share = min(0.5, 2 * self.cell_gap * self.cells[0] / self.size[0])
         grid = self.color * (1 - share) + self.cell_color * share
-        self.frame_color = rgb(0.05, 0.05, 0.06) * rng.uniform(0.6, 2) if rng.random() < 0.6 else grid * rng.uniform(0.6, 1.1)
+        r = rng.random()
+        self.frame_color = rgb(0.05, 0.05, 0.06) * rng.uniform(0.6, 2) if r < 0.5 else grid * rng.uniform(0.6, 1.1) if r < 0.8 else self.frame_color
         self.frame = rng.uniform(0.004, 0.03)
         self.margin = rng.uniform(0.0, 0.012)
         self.seam = (rng.uniform(0.002, 0.022), rng.uniform(0.002, 0.022))

@@ -7,6 +7,7 @@ import torch.nn.functional as F
 
 
 def loss_fn(logits: torch.Tensor, target: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+    logits = logits.float()
     bce = F.binary_cross_entropy_with_logits(logits, target, weight, reduction="sum") / weight.sum().clamp(min=1)
     p = torch.sigmoid(logits) * (weight > 0)
     t = target * (weight > 0)

@@ -98,14 +98,14 @@ class Instances(nn.Module):
         self.up, self.dec = base.up[:-1], base.dec[:-1]
         self.anchor = nn.Sequential(conv(w[2], w[2]), conv(w[2], w[2]))
         # score; centre x, y; log w, h; quadratic form (3), linear (2), constant; coefficients of the learned prototypes
-        self.head = nn.Conv2d(w[2], 11 + self.LEARNED, 1)
+        self.predict = nn.Conv2d(w[2], 11 + self.LEARNED, 1)
         self.proto = nn.Sequential(conv(w[1], w[1]), nn.Conv2d(w[1], self.LEARNED, 1))
-        nn.init.normal_(self.head.weight, std=0.01)
-        nn.init.zeros_(self.head.bias)
+        nn.init.normal_(self.predict.weight, std=0.01)
+        nn.init.zeros_(self.predict.bias)
         with torch.no_grad():
-            self.head.bias[0] = -3.0
-            self.head.bias[3:5] = 1.3
-            self.head.bias[10] = 2.0
+            self.predict.bias[0] = -3.0
+            self.predict.bias[3:5] = 1.3
+            self.predict.bias[10] = 2.0
 
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         x = self.stem(x * 4.0 - 2.0)
@@ -117,7 +117,7 @@ class Instances(nn.Module):
         for up, dec, s in zip(self.up, self.dec, reversed(skips)):
             x = dec(torch.relu(up(x) + s))
             levels.append(x)
-        return self.head(self.anchor(levels[-2])), self.proto(levels[-1])
+        return self.predict(self.anchor(levels[-2])), self.proto(levels[-1])
 
     @classmethod
     def decode(cls, head: torch.Tensor, proto: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 TEST_PLANTS = ("10", "11", "12", "13")
-VALIDATION_PLANTS = ("14", "19", "24", "29", "34", "39", "44", "49", "54", "59")
+VALIDATION_PLANTS = ("18", "23", "26", "33", "34", "39", "44", "46", "54")
 TEST_FRAMES = ("tsukuba_vegetation.jpg",)
 
 

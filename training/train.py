@@ -1,4 +1,4 @@
-"""Trains the network: `python -m training.train --out DIR [--minutes N]`. Run it again to resume."""
+"""Trains a network: `python -m training.train [--kind yolo] --out DIR [--minutes N]`. Run it again to resume."""
 
 from __future__ import annotations
 
@@ -16,14 +16,20 @@ import cv2
 import torch
 from torch.utils.data import DataLoader
 
-from . import sources
+from . import instances, loss, sources, targets
 from .dataset import Stream
-from .loss import loss_fn
-from .net import WIDTHS, UNet
+from .net import WIDTHS, Instances, UNet
+
+# What is trained: the network, its targets, its loss.
+KINDS = {
+    "unet": (UNet, targets.make_targets, loss.loss_fn),
+    "yolo": (Instances, instances.make_targets, instances.loss_fn),
+}
 
 
 def arguments() -> argparse.Namespace:
     p = argparse.ArgumentParser(description=__doc__)
+    p.add_argument("--kind", choices=KINDS, default="unet")
     p.add_argument("--out", type=Path, default=Path("runs/unet"), help="folder of checkpoints and the log")
     p.add_argument("--steps", type=int, default=5000, help="length of the learning-rate schedule")
     p.add_argument(
@@ -39,7 +45,7 @@ def arguments() -> argparse.Namespace:
     p.add_argument("--real", type=float, default=0.18, help="share of crops of hand-labelled real frames")
     p.add_argument("--self", dest="own", type=float, default=0.0, help="share of crops of self-labelled frames")
     p.add_argument("--self-labels", help="labels file of the self-labelled frames (training.bootstrap)")
-    p.add_argument("--init", type=Path, help="start from the averaged weights of this checkpoint")
+    p.add_argument("--init", type=Path, help="start from the averaged weights of this checkpoint, of either kind: what both share")
     p.add_argument("--save-every", type=float, default=120, help="seconds between checkpoints")
     return p.parse_args()
 
@@ -57,8 +63,9 @@ def main() -> None:
     torch.set_num_threads(a.threads)
     cv2.setNumThreads(0)  # OpenCV's thread pool does not survive the fork of the loader's processes
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    net = UNet(WIDTHS).to(device, memory_format=torch.channels_last)
-    mean = UNet(WIDTHS).to(device)  # running average of the weights: what is exported
+    Net, make_targets, loss_fn = KINDS[a.kind]
+    net = Net(WIDTHS).to(device, memory_format=torch.channels_last)
+    mean = Net(WIDTHS).to(device)  # running average of the weights: what is exported
     opt = torch.optim.AdamW(net.parameters(), lr=a.lr, weight_decay=1e-3)
     step, before = 0, 0.0  # steps and seconds of earlier runs
     path = a.out / "checkpoint.pt"
@@ -71,13 +78,12 @@ def main() -> None:
         print(f"resumed at step {step}", flush=True)
     elif a.init:
         state = torch.load(a.init, map_location=device, weights_only=True)
-        net.load_state_dict(state["mean"])
-        mean.load_state_dict(state["mean"])
-    else:
+        net.load_state_dict(state["mean"], strict=state.get("kind", "unet") == a.kind)
+    if not path.exists():
         mean.load_state_dict(net.state_dict())
 
     def save() -> None:
-        state = {"net": net.state_dict(), "mean": mean.state_dict(), "opt": opt.state_dict(), "step": step, "widths": WIDTHS}
+        state = {"kind": a.kind, "net": net.state_dict(), "mean": mean.state_dict(), "opt": opt.state_dict(), "step": step, "widths": WIDTHS}
         state["seconds"] = before + time.time() - begun
         torch.save(state, path.with_suffix(".tmp"))
         os.replace(path.with_suffix(".tmp"), path)
@@ -97,7 +103,7 @@ def main() -> None:
         (a.own, sources.self_labelled(a.self_labels)),
     ]
     print("photos:", [len(p) for _, p in mix], flush=True)
-    stream = Stream(mix, a.size, a.seed, start=step * a.batch)
+    stream = Stream(mix, a.size, a.seed, start=step * a.batch, targets=make_targets)
     loader = iter(DataLoader(stream, a.batch, num_workers=a.workers, prefetch_factor=6 if a.workers else None))
     net.train()
     begun = saved = time.time()
@@ -108,11 +114,11 @@ def main() -> None:
             break
         for g in opt.param_groups:
             g["lr"] = a.lr * schedule(step, max(step / a.steps, over))
-        x, y, w = (t.to(device) for t in next(loader))
+        x, *wanted = (t.to(device) for t in next(loader))
         x = x.contiguous(memory_format=torch.channels_last)
         with torch.autocast(device.type, torch.bfloat16):
-            logits = net(x)
-        loss = loss_fn(logits.float(), y, w)
+            raw = net(x)
+        loss = loss_fn(raw, *wanted)
         opt.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(net.parameters(), 2.0)
