@@ -28,7 +28,7 @@ Metadata of the file (`heliomap.*`) says the same to programs. From masks to box
 | `real-labelled`: four of five hand-labelled frames of one real plant | training | MIT, as its source states |
 {own}| rendered plants `train/10` to `13`, `example` | test | ours, CC0 |
 | `real-labelled/tsukuba_vegetation` | test (same plant as the four above, another frame) | MIT, as its source states |
-| `missouri-west`, 14 frames of the northernmost flight line, labels in `training/labels` | test | photos: no licence stated, not shipped; labels: ours |
+| `missouri-west`, 21 frames of the northernmost flight line, labels in `training/labels` | test | photos: no licence stated, not shipped; labels: ours |
 
 No photo of any of these is in the repository. The example is rendered like the training plants, but no photo of it was
 trained on.

@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from . import sources
+from . import instances, sources
 from .postprocess import Box, boxes, overlap, quad_area, touches_frame
 from .runner import Runner, resample
 from .sources import Photo
@@ -119,15 +119,16 @@ def compare(photo: Photo, found: list[Box], scale: float = 1.0) -> Score:
     return s
 
 
-def detect(runner: Runner, photo: Photo, scale: float = 1.0, shrink: float = CORE_SHRINK) -> tuple[list[Box], np.ndarray]:
-    """Boxes in the photo's own pixels, and the probabilities at the working scale."""
-    prob = runner(resample(photo.image, scale))
-    found = boxes(prob, shrink)
-    size = np.array([photo.image.shape[1] / prob.shape[2], photo.image.shape[0] / prob.shape[1]])
+def detect(runner: Runner, photo: Photo, scale: float = 1.0, shrink: float = CORE_SHRINK) :
+    """Boxes in the photo's own pixels, and what the network said at the working scale."""
+    image = resample(photo.image, scale)
+    out = runner(image)
+    found = boxes(out, shrink) if runner.kind == "unet" else instances.boxes(*out)
+    size = np.array(photo.image.shape[1::-1]) / np.array(image.shape[1::-1])
     for b in found:
         b.center = (b.center + 0.5) * size - 0.5
         b.u, b.v = b.u * size, b.v * size
-    return found, prob
+    return found, out
 
 
 def working_scale(gsd: float | None) -> float:

@@ -1,6 +1,6 @@
-"""Writes the ONNX model: `python -m training.export --checkpoint runs/unet/checkpoint.pt --out models/unet.onnx`.
+"""Writes the ONNX model: `python -m training.export --checkpoint runs/both/checkpoint.pt --kind unet --out models/unet.onnx`.
 
-Either network, as the checkpoint says. Checks that ONNX Runtime and PyTorch agree on several sizes, and writes what the
+Checks that ONNX Runtime and PyTorch agree on several sizes, and writes what the
 service must know as metadata.
 """
 
@@ -24,16 +24,21 @@ TOLERANCE = 2e-3
 SIZES = ((1, 32, 32), (1, 256, 256), (2, 320, 192), (1, 928, 1376))
 
 
-def load(state: dict) -> tuple[nn.Module, str, dict[str, list[str]], dict[str, str]]:
+def take(net: nn.Module, weights: dict) -> None:
+    """Loads the network's own weights out of its checkpoint or that of both."""
+    net.load_state_dict({k: weights[k] for k in net.state_dict()})
+
+
+def load(state: dict, kind: str) -> tuple[nn.Module, str, dict[str, list[str]], dict[str, str]]:
     """The network of a checkpoint as it is exported: with its input, its outputs with their axes, its metadata."""
     widths = tuple(state["widths"])
-    if state.get("kind", "unet") == "unet":
+    if kind == "unet":
         net = UNet(widths)
-        net.load_state_dict(state["mean"])
+        take(net, state["mean"])
         meta = {"heliomap.kind": "unet", "heliomap.channels": ",".join(CHANNELS), "heliomap.core_shrink": str(CORE_SHRINK)}
         return WithSigmoid(net).eval(), "image", {"masks": ["n", "", "h", "w"]}, meta
     net = Instances(widths)
-    net.load_state_dict(state["mean"])
+    take(net, state["mean"])
     meta = {
         "heliomap.kind": "yolo",
         "heliomap.classes": "module",
@@ -48,14 +53,15 @@ def load(state: dict) -> tuple[nn.Module, str, dict[str, list[str]], dict[str, s
 
 def main() -> None:
     p = argparse.ArgumentParser(description=__doc__)
-    p.add_argument("--checkpoint", type=Path, default=Path("runs/unet/checkpoint.pt"))
+    p.add_argument("--checkpoint", type=Path, default=Path("runs/both/checkpoint.pt"))
+    p.add_argument("--kind", choices=("unet", "yolo"), default="unet")
     p.add_argument("--out", type=Path, default=Path("models/unet.onnx"))
     p.add_argument("--version", default="0.2.0")
     p.add_argument("--self-frames", type=int, default=0, help="self-labelled frames it was trained on (for the card)")
     p.add_argument("--steps-before", type=int, default=0, help="steps of the weights that training started from (for the card)")
     a = p.parse_args()
     state = torch.load(a.checkpoint, map_location="cpu", weights_only=True)
-    model, name, outputs, meta = load(state)
+    model, name, outputs, meta = load(state, a.kind)
     a.out.parent.mkdir(parents=True, exist_ok=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -47,6 +47,20 @@ class Up(nn.Module):
         return self.shuffle(self.proj(x))
 
 
+def levels(net: nn.Module, x: torch.Tensor) -> list[torch.Tensor]:
+    """Features on the way up, coarsest first."""
+    x = net.stem(x * 4.0 - 2.0)
+    skips = []
+    for d in net.down:
+        skips.append(x)
+        x = d(x)
+    out = []
+    for up, dec, s in zip(net.up, net.dec, reversed(skips)):
+        x = dec(torch.relu(up(x) + s))
+        out.append(x)
+    return out
+
+
 class UNet(nn.Module):
     """`forward` gives logits [N, C, H, W] for an RGB image in 0..1 [N, 3, H, W], H and W multiples of 32."""
 
@@ -66,14 +80,7 @@ class UNet(nn.Module):
         nn.init.constant_(self.head.bias, -1.0)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        x = self.stem(x * 4.0 - 2.0)
-        skips = []
-        for d in self.down:
-            skips.append(x)
-            x = d(x)
-        for up, dec, s in zip(self.up, self.dec, reversed(skips)):
-            x = dec(torch.relu(up(x) + s))
-        return self.shuffle(self.head(x))
+        return self.shuffle(self.head(levels(self, x)[-1]))
 
 
 class Instances(nn.Module):
@@ -92,10 +99,12 @@ class Instances(nn.Module):
 
     def __init__(self, widths: tuple[int, ...] = WIDTHS):
         super().__init__()
-        w = widths
-        base = UNet(w)
+        base = UNet(widths)
         self.stem, self.down = base.stem, base.down
         self.up, self.dec = base.up[:-1], base.dec[:-1]
+        self.add_heads(widths)
+
+    def add_heads(self, w: tuple[int, ...]) -> None:
         self.anchor = nn.Sequential(conv(w[2], w[2]), conv(w[2], w[2]))
         # score; centre x, y; log w, h; quadratic form (3), linear (2), constant; coefficients of the learned prototypes
         self.predict = nn.Conv2d(w[2], 11 + self.LEARNED, 1)
@@ -108,16 +117,8 @@ class Instances(nn.Module):
             self.predict.bias[10] = 2.0
 
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        x = self.stem(x * 4.0 - 2.0)
-        skips = []
-        for d in self.down:
-            skips.append(x)
-            x = d(x)
-        levels = []
-        for up, dec, s in zip(self.up, self.dec, reversed(skips)):
-            x = dec(torch.relu(up(x) + s))
-            levels.append(x)
-        return self.predict(self.anchor(levels[-2])), self.proto(levels[-1])
+        up = levels(self, x)
+        return self.predict(self.anchor(up[-2])), self.proto(up[-1])
 
     @classmethod
     def decode(cls, head: torch.Tensor, proto: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -153,6 +154,20 @@ class Instances(nn.Module):
         gy, gx = torch.meshgrid(py, px, indexing="ij")
         grid = torch.stack([torch.ones_like(gx), gx, gy, gx * gx, gx * gy, gy * gy])
         return out0.flatten(2), torch.cat([proto, grid[None].expand(n, -1, -1, -1)], 1)
+
+
+class Joint(UNet):
+    """Both networks on one trunk, for training: two cores have not the time for two trunks. Either is exported alone."""
+
+    LEARNED = Instances.LEARNED
+
+    def __init__(self, widths: tuple[int, ...] = WIDTHS):
+        super().__init__(widths)
+        Instances.add_heads(self, widths)
+
+    def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        up = levels(self, x)
+        return self.shuffle(self.head(up[-1])), self.predict(self.anchor(up[-3])), self.proto(up[-2])
 
 
 class Decoded(nn.Module):

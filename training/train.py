@@ -1,4 +1,4 @@
-"""Trains a network: `python -m training.train [--kind yolo] --out DIR [--minutes N]`. Run it again to resume."""
+"""Trains both networks: `python -m training.train --out DIR [--minutes N]`. Run it again to resume."""
 
 from __future__ import annotations
 
@@ -18,18 +18,30 @@ from torch.utils.data import DataLoader
 
 from . import instances, loss, sources, targets
 from .dataset import Stream
-from .net import WIDTHS, Instances, UNet
+from .net import WIDTHS, Instances, Joint, UNet
+
+INSTANCE_SHARE = 0.3  # weight of the instance network's loss where both are trained on one trunk
+
+
+def joint_targets(quads, ignore, size):
+    return *targets.make_targets(quads, ignore, size), *instances.make_targets(quads, ignore, size)
+
+
+def joint_loss(raw, target, weight, cells, ids):
+    return loss.loss_fn(raw[0], target, weight) + INSTANCE_SHARE * instances.loss_fn(raw[1:], cells, ids)
+
 
 # What is trained: the network, its targets, its loss.
 KINDS = {
     "unet": (UNet, targets.make_targets, loss.loss_fn),
     "yolo": (Instances, instances.make_targets, instances.loss_fn),
+    "joint": (Joint, joint_targets, joint_loss),
 }
 
 
 def arguments() -> argparse.Namespace:
     p = argparse.ArgumentParser(description=__doc__)
-    p.add_argument("--kind", choices=KINDS, default="unet")
+    p.add_argument("--kind", choices=KINDS, default="joint")
     p.add_argument("--out", type=Path, default=Path("runs/unet"), help="folder of checkpoints and the log")
     p.add_argument("--steps", type=int, default=5000, help="length of the learning-rate schedule")
     p.add_argument(
@@ -78,7 +90,7 @@ def main() -> None:
         print(f"resumed at step {step}", flush=True)
     elif a.init:
         state = torch.load(a.init, map_location=device, weights_only=True)
-        net.load_state_dict(state["mean"], strict=state.get("kind", "unet") == a.kind)
+        net.load_state_dict(state["mean"], strict=False)
     if not path.exists():
         mean.load_state_dict(net.state_dict())
 
@@ -118,9 +130,9 @@ def main() -> None:
         x = x.contiguous(memory_format=torch.channels_last)
         with torch.autocast(device.type, torch.bfloat16):
             raw = net(x)
-        loss = loss_fn(raw, *wanted)
+        value = loss_fn(raw, *wanted)
         opt.zero_grad(set_to_none=True)
-        loss.backward()
+        value.backward()
         torch.nn.utils.clip_grad_norm_(net.parameters(), 2.0)
         opt.step()
         step += 1
@@ -131,7 +143,7 @@ def main() -> None:
                     m.lerp_(n, 1 - k)
                 else:
                     m.copy_(n)
-        average = loss.item() if average == 0 else 0.98 * average + 0.02 * loss.item()
+        average = value.item() if average == 0 else 0.98 * average + 0.02 * value.item()
         now = time.time()
         if step % 50 == 0:
             pace = (now - begun) / (step - first)
