@@ -99,7 +99,7 @@ def start_service(binary: Path, keep: bool) -> tuple[subprocess.Popen, str]:
     subprocess.run(["rm", "-rf", str(data)], check=True)
     log = open(OUT / "service.log", "w")
     service = subprocess.Popen(
-        [str(binary), "serve", "--listen", f"127.0.0.1:{port_for(keep)}", "--data-dir", str(data),
+        [str(binary), "serve", "--insecure", "--listen", f"127.0.0.1:{port_for(keep)}", "--data-dir", str(data),
          "--detector", str(ROOT / "models" / "unet.onnx")],
         stdout=subprocess.PIPE, stderr=log, text=True, start_new_session=True,
     )

@@ -1,6 +1,8 @@
 //! The command line: flags, each with an environment variable, parsed once.
 
-use clap::{Args, ValueEnum};
+use crate::plant::PlantId;
+use crate::store::{KeyId, Scope};
+use clap::{Args, Subcommand, ValueEnum};
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::Duration;
@@ -34,6 +36,9 @@ pub struct ServeArgs {
     /// Run no jobs in this process; leave them to `heliomap worker`.
     #[arg(long, env = "HELIOMAP_NO_WORKER")]
     pub no_worker: bool,
+    /// Ask for no keys: whoever reaches the service may do everything. Only on a loopback address.
+    #[arg(long, env = "HELIOMAP_INSECURE")]
+    pub insecure: bool,
     #[command(flatten)]
     pub storage: StorageArgs,
     #[command(flatten)]
@@ -49,6 +54,59 @@ pub struct WorkerArgs {
     pub storage: StorageArgs,
     #[command(flatten)]
     pub detector: DetectorArgs,
+}
+
+/// `heliomap keys`.
+#[derive(Debug, Clone, Args)]
+pub struct KeysArgs {
+    #[command(flatten)]
+    pub storage: StorageArgs,
+    #[command(subcommand)]
+    pub command: KeysCommand,
+}
+
+/// What is done about keys.
+#[derive(Debug, Clone, Subcommand)]
+pub enum KeysCommand {
+    /// Make a key and print its secret, which is kept nowhere.
+    Create {
+        /// What people call it.
+        #[arg(long, value_name = "NAME")]
+        name: String,
+        /// What it is good for; may be given more than once.
+        #[arg(long, value_enum, value_name = "SCOPE", required = true)]
+        scope: Vec<Scope>,
+        /// The organisation that it belongs to, by name; made where there is none.
+        #[arg(long, value_name = "NAME", default_value = "default")]
+        organisation: String,
+        /// A plant that it is good for; may be given more than once; all plants where it is not given.
+        #[arg(long, value_name = "UUID")]
+        plant: Vec<PlantId>,
+        /// Days after which it ends; never where it is not given.
+        #[arg(long, value_name = "N")]
+        days: Option<u32>,
+    },
+    /// List all keys.
+    List,
+    /// Make a key good for nothing, for ever.
+    Revoke {
+        /// The key's identifier.
+        #[arg(value_parser = parse_key_id, value_name = "UUID")]
+        id: KeyId,
+    },
+    /// Give a key a new secret and print it.
+    Rotate {
+        /// The key's identifier.
+        #[arg(value_parser = parse_key_id, value_name = "UUID")]
+        id: KeyId,
+        /// Hours for which the secret so far stays good.
+        #[arg(long, value_name = "N", default_value_t = 0)]
+        grace_hours: u32,
+    },
+}
+
+fn parse_key_id(text: &str) -> Result<KeyId, uuid::Error> {
+    text.parse().map(KeyId)
 }
 
 /// `heliomap openapi`.

@@ -3,7 +3,7 @@
 mod commands;
 
 use clap::{Parser, Subcommand};
-use heliomap::config::{LogArgs, OpenapiArgs, ServeArgs, WorkerArgs};
+use heliomap::config::{KeysArgs, LogArgs, OpenapiArgs, ServeArgs, WorkerArgs};
 
 /// Maps photovoltaic plants from drone overview photos: every module georeferenced, with its place in the plant.
 #[derive(Debug, Parser)]
@@ -22,6 +22,8 @@ enum Command {
     Serve(ServeArgs),
     /// Run mapping jobs for a service with the same data folder.
     Worker(WorkerArgs),
+    /// Make, list, rotate and revoke keys to the service.
+    Keys(KeysArgs),
     /// Map the plant in a folder as OpenSfM leaves it; no server is needed.
     Map(commands::map::MapArgs),
     /// Compare a plant with a truth or any reference model.
@@ -36,6 +38,7 @@ fn main() -> anyhow::Result<()> {
     match cli.command {
         Command::Serve(args) => commands::serve::run(args),
         Command::Worker(args) => commands::worker::run(args),
+        Command::Keys(args) => commands::keys::run(args),
         Command::Map(args) => commands::map::run(&args),
         Command::Evaluate(args) => commands::evaluate::run(&args),
         Command::Openapi(args) => commands::openapi::run(&args),

@@ -1,6 +1,7 @@
 //! One file per command. Here alone, concrete backends are named.
 
 pub mod evaluate;
+pub mod keys;
 pub mod map;
 pub mod openapi;
 pub mod serve;

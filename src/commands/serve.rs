@@ -4,6 +4,7 @@ use super::{GRACE, open_storage, pipeline_worker, run_async, stop_signal};
 use anyhow::Context;
 use heliomap::config::ServeArgs;
 use heliomap::http::{self, AppState};
+use heliomap::store::Page;
 use std::sync::Arc;
 use tokio::net::TcpListener;
 use tokio::sync::Notify;
@@ -11,6 +12,12 @@ use tokio::sync::Notify;
 /// Serves until the process is told to stop.
 pub fn run(args: ServeArgs) -> anyhow::Result<()> {
     run_async(async {
+        anyhow::ensure!(
+            !args.insecure || args.listen.ip().is_loopback(),
+            "--insecure lets anyone in who reaches {}: listen on a loopback address such as 127.0.0.1:8080, or leave \
+             --insecure out and make keys with `heliomap keys create`",
+            args.listen
+        );
         let (store, blobs) = open_storage(&args.storage).await?;
         let stop = stop_signal()?;
         let bell = Arc::new(Notify::new());
@@ -23,9 +30,21 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
         let worker_stop = stop.clone();
         let working = (!args.no_worker).then(|| tokio::spawn(async move { worker.run(worker_stop).await }));
 
-        let app = http::router(AppState { store, blobs, limits: Arc::new(args.limits), bell });
+        let app = http::router(AppState {
+            store: store.clone(),
+            blobs,
+            limits: Arc::new(args.limits),
+            bell,
+            insecure: args.insecure,
+        });
         let shutdown = stop.clone().cancelled_owned();
         let serving = tokio::spawn(axum::serve(listener, app).with_graceful_shutdown(shutdown).into_future());
+        if !args.insecure && store.keys(None, Page { after: None, limit: 1 }).await?.is_empty() {
+            tracing::warn!(
+                "there is no key yet, so nobody gets in: make the first with `heliomap keys create --scope admin --name NAME` \
+                 on the same data folder"
+            );
+        }
         println!("heliomap is listening on http://{address}");
 
         stop.cancelled().await;

@@ -11,6 +11,7 @@ use axum::response::{IntoResponse, Response};
     get,
     path = "/openapi.yaml",
     tag = "operation",
+    security(()),
     responses((status = 200, description = "OpenAPI 3.1", content_type = "application/yaml", body = String))
 )]
 pub async fn openapi_yaml() -> Result<Response, ApiError> {
@@ -23,6 +24,7 @@ pub async fn openapi_yaml() -> Result<Response, ApiError> {
     get,
     path = "/openapi.json",
     tag = "operation",
+    security(()),
     responses((status = 200, description = "OpenAPI 3.1", content_type = "application/json", body = serde_json::Value))
 )]
 pub async fn openapi_json() -> Json<utoipa::openapi::OpenApi> {

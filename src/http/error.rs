@@ -38,11 +38,14 @@ codes! {
     InvalidQuery = BAD_REQUEST, "invalid_query", "A query parameter is wrong";
     InvalidJson = BAD_REQUEST, "invalid_json", "The body is no JSON";
     UploadInterrupted = BAD_REQUEST, "upload_interrupted", "The upload ended early";
+    Unauthorized = UNAUTHORIZED, "unauthorized", "A key is needed";
+    Forbidden = FORBIDDEN, "forbidden", "The key does not open this";
     NotFound = NOT_FOUND, "not_found", "There is nothing here";
     PlantNotFound = NOT_FOUND, "plant_not_found", "There is no such plant";
     SurveyNotFound = NOT_FOUND, "survey_not_found", "There is no such survey";
     JobNotFound = NOT_FOUND, "job_not_found", "There is no such job";
     ModelNotFound = NOT_FOUND, "model_not_found", "There is no such model";
+    KeyNotFound = NOT_FOUND, "key_not_found", "There is no such key";
     ModuleNotFound = NOT_FOUND, "module_not_found", "There is no such module";
     MethodNotAllowed = METHOD_NOT_ALLOWED, "method_not_allowed", "The method does not apply here";
     Timeout = REQUEST_TIMEOUT, "timeout", "The request took too long";

@@ -79,6 +79,7 @@ impl FeaturesQuery {
     get,
     path = "/api/v1/plants/{plant}/models/{version}/{layer}",
     tag = "models",
+    security(("key" = ["read"]), ("key" = ["review"])),
     params(
         ("plant" = Uuid, Path, description = "The plant's identifier"),
         ("version" = String, Path, description = "The model's version, or `latest`"),
@@ -208,6 +209,7 @@ pub struct ModuleQuery {
     get,
     path = "/api/v1/plants/{plant}/modules/{module}",
     tag = "models",
+    security(("key" = ["read"]), ("key" = ["review"])),
     params(
         ("plant" = Uuid, Path, description = "The plant's identifier"),
         ("module" = Uuid, Path, description = "The module's identifier"),

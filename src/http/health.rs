@@ -18,7 +18,7 @@ pub struct Health {
 const FINE: Health = Health { status: "ok", version: env!("CARGO_PKG_VERSION") };
 
 /// Whether the process runs
-#[utoipa::path(get, path = "/health", tag = "operation", responses((status = 200, body = Health)))]
+#[utoipa::path(get, path = "/health", tag = "operation", security(()), responses((status = 200, body = Health)))]
 pub async fn health() -> Json<Health> {
     Json(FINE)
 }
@@ -28,6 +28,7 @@ pub async fn health() -> Json<Health> {
     get,
     path = "/ready",
     tag = "operation",
+    security(()),
     responses(
         (status = 200, body = Health),
         (status = 503, description = "`unavailable`", body = Problem, content_type = "application/problem+json")

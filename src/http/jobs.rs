@@ -187,6 +187,7 @@ fn place(plant: PlantId, job: JobId) -> String {
     post,
     path = "/api/v1/plants/{plant}/surveys/{survey}/jobs",
     tag = "jobs",
+    security(("key" = ["upload"])),
     params(
         ("plant" = Uuid, Path, description = "The plant's identifier"),
         ("survey" = Uuid, Path, description = "The survey's identifier")
@@ -247,6 +248,7 @@ pub async fn start(
     get,
     path = "/api/v1/plants/{plant}/surveys/{survey}/jobs",
     tag = "jobs",
+    security(("key" = ["read"]), ("key" = ["review"]), ("key" = ["upload"])),
     params(
         ("plant" = Uuid, Path, description = "The plant's identifier"),
         ("survey" = Uuid, Path, description = "The survey's identifier"),
@@ -274,6 +276,7 @@ pub async fn list_of_survey(
     get,
     path = "/api/v1/plants/{plant}/jobs",
     tag = "jobs",
+    security(("key" = ["read"]), ("key" = ["review"]), ("key" = ["upload"])),
     params(("plant" = Uuid, Path, description = "The plant's identifier"), PageQuery),
     responses(
         (status = 200, body = List<JobView>),
@@ -299,6 +302,7 @@ pub async fn list(
     get,
     path = "/api/v1/plants/{plant}/jobs/{job}",
     tag = "jobs",
+    security(("key" = ["read"]), ("key" = ["review"]), ("key" = ["upload"])),
     params(
         ("plant" = Uuid, Path, description = "The plant's identifier"),
         ("job" = Uuid, Path, description = "The job's identifier")
@@ -325,6 +329,7 @@ pub async fn get(
     post,
     path = "/api/v1/plants/{plant}/jobs/{job}/cancel",
     tag = "jobs",
+    security(("key" = ["upload"])),
     params(
         ("plant" = Uuid, Path, description = "The plant's identifier"),
         ("job" = Uuid, Path, description = "The job's identifier")

@@ -93,6 +93,7 @@ pub async fn require_model(state: &AppState, plant: PlantId, version: &str) -> R
     get,
     path = "/api/v1/plants/{plant}/models",
     tag = "models",
+    security(("key" = ["read"]), ("key" = ["review"])),
     params(("plant" = Uuid, Path, description = "The plant's identifier"), PageQuery),
     responses(
         (status = 200, body = List<ModelView>),
@@ -116,6 +117,7 @@ pub async fn list(
     get,
     path = "/api/v1/plants/{plant}/models/{version}",
     tag = "models",
+    security(("key" = ["read"]), ("key" = ["review"])),
     params(
         ("plant" = Uuid, Path, description = "The plant's identifier"),
         ("version" = String, Path, description = "The model's version, or `latest`")

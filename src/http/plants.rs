@@ -3,6 +3,7 @@
 use super::AppState;
 use super::error::{ApiError, Code, Problem};
 use super::extract::{ApiJson, ApiPath, ApiQuery};
+use super::guard::Caller;
 use super::paging::{List, PageQuery};
 use crate::plant::PlantId;
 use crate::store::{Created, Plant};
@@ -17,7 +18,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct NewPlant {
-    /// What people call it; no two plants have the same name.
+    /// What people call it; no two plants of an organisation have the same name.
     #[schema(min_length = 1, max_length = 200, example = "Sunfield North")]
     pub name: String,
 }
@@ -59,6 +60,7 @@ pub fn created_answer<T: Serialize>(location: String, new: bool, view: T) -> Res
     post,
     path = "/api/v1/plants",
     tag = "plants",
+    security(("key" = ["upload"])),
     request_body = NewPlant,
     responses(
         (status = 201, description = "Created", body = PlantView, headers(("location" = String))),
@@ -67,8 +69,14 @@ pub fn created_answer<T: Serialize>(location: String, new: bool, view: T) -> Res
             body = Problem, content_type = "application/problem+json")
     )
 )]
-pub async fn create(State(state): State<AppState>, ApiJson(new): ApiJson<NewPlant>) -> Result<Response, ApiError> {
-    let (plant, new) = match state.store.create_plant(checked_name(&new.name)?, Timestamp::now()).await? {
+pub async fn create(
+    State(state): State<AppState>,
+    caller: Caller,
+    ApiJson(new): ApiJson<NewPlant>,
+) -> Result<Response, ApiError> {
+    caller.require_all_plants()?;
+    let name = checked_name(&new.name)?;
+    let (plant, new) = match state.store.create_plant(caller.organisation, name, Timestamp::now()).await? {
         Created::New(plant) => (plant, true),
         Created::Existing(plant) => (plant, false),
     };
@@ -80,6 +88,7 @@ pub async fn create(State(state): State<AppState>, ApiJson(new): ApiJson<NewPlan
     get,
     path = "/api/v1/plants",
     tag = "plants",
+    security(("key" = ["read"]), ("key" = ["review"]), ("key" = ["upload"])),
     params(PageQuery),
     responses(
         (status = 200, body = List<PlantView>),
@@ -88,9 +97,10 @@ pub async fn create(State(state): State<AppState>, ApiJson(new): ApiJson<NewPlan
 )]
 pub async fn list(
     State(state): State<AppState>,
+    caller: Caller,
     ApiQuery(query): ApiQuery<PageQuery>,
 ) -> Result<List<PlantView>, ApiError> {
-    let plants = state.store.plants(query.page()?).await?;
+    let plants = state.store.plants(caller.organisation, caller.plants.as_deref(), query.page()?).await?;
     query.items("/api/v1/plants", plants, |plant| plant.seq, PlantView::from)
 }
 
@@ -99,6 +109,7 @@ pub async fn list(
     get,
     path = "/api/v1/plants/{plant}",
     tag = "plants",
+    security(("key" = ["read"]), ("key" = ["review"]), ("key" = ["upload"])),
     params(("plant" = Uuid, Path, description = "The plant's identifier")),
     responses(
         (status = 200, body = PlantView),
@@ -111,15 +122,16 @@ pub async fn get(State(state): State<AppState>, ApiPath(plant): ApiPath<PlantId>
 
 /// Delete a plant with its surveys, files, jobs and models
 ///
-/// A job that runs is stopped. Deleting a plant that is not there is 204 too: the request may be repeated.
+/// A job that runs is stopped.
 #[utoipa::path(
     delete,
     path = "/api/v1/plants/{plant}",
     tag = "plants",
+    security(("key" = ["admin"])),
     params(("plant" = Uuid, Path, description = "The plant's identifier")),
     responses(
         (status = 204, description = "Nothing of it is left"),
-        (status = 404, description = "`not_found`: no identifier", body = Problem, content_type = "application/problem+json")
+        (status = 404, description = "`plant_not_found`", body = Problem, content_type = "application/problem+json")
     )
 )]
 pub async fn delete(State(state): State<AppState>, ApiPath(plant): ApiPath<PlantId>) -> Result<StatusCode, ApiError> {

@@ -1,16 +1,18 @@
 //! The table of contents.
 
-use super::{AppState, docs, error, features, health, jobs, models, page, plants, surveys, uploads};
+use super::guard::{Gate, Policy};
+use super::{AppState, docs, error, features, guard, health, jobs, keys, models, page, plants, surveys, uploads};
 use axum::Router;
 use axum::body::Body;
 use axum::extract::{DefaultBodyLimit, Request};
 use axum::http::{HeaderName, HeaderValue, StatusCode};
 use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
+use std::sync::Arc;
 use std::time::Duration;
 use tower_http::catch_panic::CatchPanicLayer;
 use tower_http::compression::CompressionLayer;
-use tower_http::request_id::{MakeRequestUuid, PropagateRequestIdLayer, RequestId, SetRequestIdLayer};
+use tower_http::request_id::{MakeRequestUuid, PropagateRequestIdLayer, SetRequestIdLayer};
 use tower_http::timeout::TimeoutLayer;
 use tower_http::trace::TraceLayer;
 use tracing::Span;
@@ -38,6 +40,7 @@ const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
         (name = "surveys", description = "Flights over a plant: photos and their reconstruction."),
         (name = "jobs", description = "Mappings of a survey."),
         (name = "models", description = "What was found: modules, sectors, benches and lines as GeoJSON."),
+        (name = "access", description = "Keys, and what was done with them."),
         (name = "operation", description = "Whether the service runs, and what it offers.")
     )
 )]
@@ -58,6 +61,10 @@ fn prompt() -> OpenApiRouter<AppState> {
         .routes(routes!(models::get))
         .routes(routes!(features::layer))
         .routes(routes!(features::module))
+        .routes(routes!(keys::create, keys::list))
+        .routes(routes!(keys::get, keys::revoke))
+        .routes(routes!(keys::rotate))
+        .routes(routes!(keys::audit))
         .routes(routes!(health::health))
         .routes(routes!(health::ready))
         .routes(routes!(docs::openapi_yaml))
@@ -75,7 +82,10 @@ fn uploads() -> OpenApiRouter<AppState> {
 
 /// The description of the whole API.
 pub fn openapi() -> utoipa::openapi::OpenApi {
-    OpenApiRouter::with_openapi(Description::openapi()).merge(prompt()).merge(uploads()).into_openapi()
+    let mut description =
+        OpenApiRouter::with_openapi(Description::openapi()).merge(prompt()).merge(uploads()).into_openapi();
+    guard::describe(&mut description);
+    description
 }
 
 /// The whole service.
@@ -83,8 +93,10 @@ pub fn router(state: AppState) -> Router {
     let timeout = TimeoutLayer::with_status_code(StatusCode::REQUEST_TIMEOUT, state.limits.request_timeout);
     let prompt = prompt().layer(DefaultBodyLimit::max(MAX_JSON_BYTES)).layer(timeout);
     let uploads = uploads().layer(DefaultBodyLimit::disable());
-    let (router, _) = OpenApiRouter::new().merge(prompt).merge(uploads).split_for_parts();
+    let (router, description) = OpenApiRouter::new().merge(prompt).merge(uploads).split_for_parts();
+    let gate = Gate { state: state.clone(), policy: Arc::new(Policy::of(&description)) };
     router
+        .route_layer(middleware::from_fn_with_state(gate, guard::guard))
         .fallback(page::serve)
         .method_not_allowed_fallback(|| async { StatusCode::METHOD_NOT_ALLOWED })
         .with_state(state)
@@ -110,7 +122,7 @@ async fn sane_request_id(mut request: Request, next: Next) -> Response {
 }
 
 fn span(request: &axum::http::Request<Body>) -> Span {
-    let id = request.extensions().get::<RequestId>().and_then(|id| id.header_value().to_str().ok()).unwrap_or("");
+    let id = guard::request_id(request);
     tracing::info_span!("request", method = %request.method(), path = request.uri().path(), id)
 }
 

@@ -15,17 +15,20 @@ pub struct AppState {
     pub limits: Arc<Limits>,
     /// Rung when a job was queued.
     pub bell: Arc<Notify>,
+    /// Whether anyone may do anything, without a key.
+    pub insecure: bool,
 }
 
 impl AppState {
     /// The plant, or a problem.
     pub async fn require_plant(&self, plant: PlantId) -> Result<Plant, ApiError> {
-        self.store.plant(plant).await?.ok_or_else(|| {
-            ApiError::new(
-                Code::PlantNotFound,
-                format!("no plant has the identifier {plant}; GET /api/v1/plants lists them"),
-            )
-        })
+        self.store.plant(plant).await?.ok_or_else(|| Self::no_plant(plant))
+    }
+
+    /// What is said of a plant that is not there, or not for the caller to see.
+    pub fn no_plant(plant: PlantId) -> ApiError {
+        let detail = format!("no plant has the identifier {plant}; GET /api/v1/plants lists them");
+        ApiError::new(Code::PlantNotFound, detail)
     }
 
     /// The survey of the plant, or a problem.

@@ -109,6 +109,7 @@ impl From<FileRecord> for FileView {
     post,
     path = "/api/v1/plants/{plant}/surveys",
     tag = "surveys",
+    security(("key" = ["upload"])),
     params(("plant" = Uuid, Path, description = "The plant's identifier")),
     request_body = NewSurvey,
     responses(
@@ -138,6 +139,7 @@ pub async fn create(
     get,
     path = "/api/v1/plants/{plant}/surveys",
     tag = "surveys",
+    security(("key" = ["read"]), ("key" = ["review"]), ("key" = ["upload"])),
     params(("plant" = Uuid, Path, description = "The plant's identifier"), PageQuery),
     responses(
         (status = 200, body = List<SurveyView>),
@@ -161,6 +163,7 @@ pub async fn list(
     get,
     path = "/api/v1/plants/{plant}/surveys/{survey}",
     tag = "surveys",
+    security(("key" = ["read"]), ("key" = ["review"]), ("key" = ["upload"])),
     params(
         ("plant" = Uuid, Path, description = "The plant's identifier"),
         ("survey" = Uuid, Path, description = "The survey's identifier")

@@ -61,6 +61,7 @@ fn uploaded((record, written): (FileRecord, FileWritten)) -> UploadedFile {
     put,
     path = "/api/v1/plants/{plant}/surveys/{survey}/images/{name}",
     tag = "surveys",
+    security(("key" = ["upload"])),
     params(
         ("plant" = Uuid, Path, description = "The plant's identifier"),
         ("survey" = Uuid, Path, description = "The survey's identifier"),
@@ -95,6 +96,7 @@ pub async fn put_image(
     put,
     path = "/api/v1/plants/{plant}/surveys/{survey}/reconstruction/{*path}",
     tag = "surveys",
+    security(("key" = ["upload"])),
     params(
         ("plant" = Uuid, Path, description = "The plant's identifier"),
         ("survey" = Uuid, Path, description = "The survey's identifier"),
@@ -179,6 +181,7 @@ async fn receive_body(
     post,
     path = "/api/v1/plants/{plant}/surveys/{survey}/images",
     tag = "surveys",
+    security(("key" = ["upload"])),
     params(
         ("plant" = Uuid, Path, description = "The plant's identifier"),
         ("survey" = Uuid, Path, description = "The survey's identifier")
@@ -279,6 +282,7 @@ struct PhotoForm {
     put,
     path = "/api/v1/plants/{plant}/surveys/{survey}/reconstruction",
     tag = "surveys",
+    security(("key" = ["upload"])),
     params(
         ("plant" = Uuid, Path, description = "The plant's identifier"),
         ("survey" = Uuid, Path, description = "The survey's identifier")
@@ -330,6 +334,7 @@ pub async fn put_reconstruction(
     post,
     path = "/api/v1/plants/{plant}/surveys/{survey}/reconstruction",
     tag = "surveys",
+    security(("key" = ["upload"])),
     params(
         ("plant" = Uuid, Path, description = "The plant's identifier"),
         ("survey" = Uuid, Path, description = "The survey's identifier")

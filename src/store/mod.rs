@@ -1,21 +1,25 @@
 //! What the service remembers: rows in a database behind one trait, bytes in a blob store.
 //!
 //! A method of [`Store`] is one atomic action of the domain: it happens as a whole or not at all, whoever dies in
-//! between. Statements are written once in `sql.rs`; a backend holds only what differs.
+//! between. Statements (`sql.rs`) and methods (`backend/`) are written once; a database's own file holds what differs.
 
+pub mod access;
 pub mod blobs;
 pub mod records;
+pub mod secret;
 pub mod sqlite;
 pub mod survey_path;
 
 mod sql;
 
+pub use access::{AccessStore, ApiKey, AuditEntry, KeyId, NewKey, Organisation, OrganisationId, Scope, SecretRecord};
 pub use blobs::{Blobs, Digest, StagedFile};
 pub use records::{
     Cancelled, Claim, Completed, Created, Ending, Enqueued, Feature, FeatureQuery, FileRecord, FileWritten, GeoBox,
     Heartbeat, Job, JobId, JobRequest, JobState, LayerInfo, Model, NewFeature, NewLayer, NewModel, Page, Plant,
     Progress, Survey, SurveyId,
 };
+pub use secret::Secret;
 pub use sqlite::SqliteStore;
 pub use survey_path::{Content, FileKind, ImageName, InvalidPath, SurveyPath};
 
@@ -61,16 +65,26 @@ impl StoreError {
 
 /// The rows. Absence is `Ok(None)`; the time comes in from the caller.
 #[async_trait::async_trait]
-pub trait Store: Send + Sync + 'static {
+pub trait Store: AccessStore {
     /// Fails where the database does not answer.
     async fn ping(&self) -> Result<(), StoreError>;
 
-    /// Creates a plant, or finds the one of that name.
-    async fn create_plant(&self, name: &str, now: Timestamp) -> Result<Created<Plant>, StoreError>;
-    /// One plant.
+    /// Creates an organisation's plant, or finds the one of that name.
+    async fn create_plant(
+        &self,
+        organisation: OrganisationId,
+        name: &str,
+        now: Timestamp,
+    ) -> Result<Created<Plant>, StoreError>;
+    /// One plant, whoever owns it.
     async fn plant(&self, id: PlantId) -> Result<Option<Plant>, StoreError>;
-    /// Plants in the order of their creation.
-    async fn plants(&self, page: Page) -> Result<Vec<Plant>, StoreError>;
+    /// An organisation's plants, or those of them that are in a list, in the order of their creation.
+    async fn plants(
+        &self,
+        organisation: OrganisationId,
+        only: Option<&[PlantId]>,
+        page: Page,
+    ) -> Result<Vec<Plant>, StoreError>;
     /// Deletes a plant with every row that belongs to it; whether there was one. Its workers lose their jobs.
     async fn delete_plant(&self, id: PlantId) -> Result<bool, StoreError>;
 

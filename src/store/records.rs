@@ -1,5 +1,6 @@
 //! What the store takes and gives.
 
+use super::access::OrganisationId;
 use super::blobs::Digest;
 use super::survey_path::SurveyPath;
 use crate::plant::{Layer, PlantId, Warning};
@@ -22,6 +23,8 @@ macro_rules! row_id {
         }
     };
 }
+
+pub(super) use row_id;
 
 row_id!(
     /// Identifies a survey: one flight over a plant.
@@ -51,6 +54,7 @@ pub enum Created<T> {
 pub struct Plant {
     pub seq: i64,
     pub id: PlantId,
+    pub organisation: OrganisationId,
     pub name: String,
     pub created: Timestamp,
 }

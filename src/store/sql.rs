@@ -3,7 +3,12 @@
 
 macro_rules! plant {
     () => {
-        "seq, id, name, created_ms"
+        "seq, id, organisation_id, name, created_ms"
+    };
+}
+macro_rules! key {
+    () => {
+        "seq, id, organisation_id, name, prefix, scopes, plants, created_ms, expires_ms, revoked_ms, last_used_ms"
     };
 }
 macro_rules! survey {
@@ -25,13 +30,60 @@ macro_rules! model {
 
 pub const PING: &str = "SELECT 1";
 
+pub const CREATE_ORGANISATION: &str = "\
+    INSERT INTO organisations (id, name, created_ms) VALUES ($1, $2, $3) ON CONFLICT (name) DO NOTHING \
+    RETURNING id, name, created_ms";
+pub const ORGANISATION_BY_NAME: &str = "SELECT id, name, created_ms FROM organisations WHERE name = $1";
+
+pub const CREATE_KEY: &str = concat!(
+    "INSERT INTO api_keys (id, organisation_id, name, prefix, sha256, scopes, plants, created_ms, expires_ms) \
+     VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9) RETURNING ",
+    key!()
+);
+pub const KEY: &str = concat!("SELECT ", key!(), " FROM api_keys WHERE organisation_id = $1 AND id = $2");
+pub const KEYS: &str = concat!(
+    "SELECT ",
+    key!(),
+    " FROM api_keys WHERE organisation_id = COALESCE($1, organisation_id) AND seq > $2 ORDER BY seq LIMIT $3"
+);
+pub const KEY_OF_SECRET: &str = concat!(
+    "SELECT ",
+    key!(),
+    " FROM api_keys WHERE (sha256 = $1 OR (previous_sha256 = $1 AND previous_until_ms > $2)) \
+     AND revoked_ms IS NULL AND (expires_ms IS NULL OR expires_ms > $2)"
+);
+pub const REVOKE_KEY: &str = concat!(
+    "UPDATE api_keys SET revoked_ms = COALESCE(revoked_ms, $3) WHERE organisation_id = $1 AND id = $2 RETURNING ",
+    key!()
+);
+pub const ROTATE_KEY: &str = concat!(
+    "UPDATE api_keys SET previous_sha256 = sha256, previous_until_ms = $5, prefix = $3, sha256 = $4 \
+     WHERE organisation_id = $1 AND id = $2 AND revoked_ms IS NULL RETURNING ",
+    key!()
+);
+pub const KEY_USED: &str = "UPDATE api_keys SET last_used_ms = $2 WHERE id = $1";
+
+pub const RECORD: &str = "\
+    INSERT INTO audit (organisation_id, at_ms, key_id, key_name, method, path, status, request_id) \
+    VALUES ($1, $2, $3, $4, $5, $6, $7, $8)";
+pub const AUDIT: &str = "\
+    SELECT seq, organisation_id, at_ms, key_id, key_name, method, path, status, request_id FROM audit \
+    WHERE organisation_id = $1 AND seq < $2 ORDER BY seq DESC LIMIT $3";
+
 pub const CREATE_PLANT: &str = concat!(
-    "INSERT INTO plants (id, name, created_ms) VALUES ($1, $2, $3) ON CONFLICT (name) DO NOTHING RETURNING ",
+    "INSERT INTO plants (id, organisation_id, name, created_ms) VALUES ($1, $2, $3, $4) \
+     ON CONFLICT (organisation_id, name) DO NOTHING RETURNING ",
     plant!()
 );
-pub const PLANT_BY_NAME: &str = concat!("SELECT ", plant!(), " FROM plants WHERE name = $1");
+pub const PLANT_BY_NAME: &str = concat!("SELECT ", plant!(), " FROM plants WHERE organisation_id = $1 AND name = $2");
 pub const PLANT: &str = concat!("SELECT ", plant!(), " FROM plants WHERE id = $1");
-pub const PLANTS: &str = concat!("SELECT ", plant!(), " FROM plants WHERE seq > $1 ORDER BY seq LIMIT $2");
+/// `$2` is a text that holds the identifiers of the plants that may be seen, or NULL for all.
+pub const PLANTS: &str = concat!(
+    "SELECT ",
+    plant!(),
+    " FROM plants WHERE organisation_id = $1 AND COALESCE($2, id) LIKE '%' || id || '%' AND seq > $3 \
+     ORDER BY seq LIMIT $4"
+);
 pub const DELETE_PLANT: &str = "DELETE FROM plants WHERE id = $1";
 
 pub const CREATE_SURVEY: &str = concat!(

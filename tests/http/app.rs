@@ -7,9 +7,9 @@ use heliomap::http::{AppState, router};
 use heliomap::jobs::{Mapper, PipelineMapper, Worker, WorkerSettings};
 use heliomap::pipeline::{MapError, MapOptions, Observer, Stage, Subject};
 use heliomap::plant::{
-    Bench, BenchId, Line, LineId, Module, ModuleId, ModuleStatus, PlantModel, Sector, SectorId, Warning,
+    Bench, BenchId, Line, LineId, Module, ModuleId, ModuleStatus, PlantId, PlantModel, Sector, SectorId, Warning,
 };
-use heliomap::store::{Blobs, SqliteStore, Store};
+use heliomap::store::{Blobs, Created, NewKey, Scope, Secret, SqliteStore, Store};
 use nalgebra::Vector3;
 use reqwest::{Client, Method, RequestBuilder, Response, StatusCode};
 use serde_json::{Value, json};
@@ -144,6 +144,9 @@ pub struct App {
     pub client: Client,
     pub mapper: Arc<ScriptedMapper>,
     pub folder: TempDir,
+    pub store: Arc<dyn Store>,
+    /// The secret that requests show.
+    pub secret: Option<String>,
     _stop: DropGuard,
 }
 
@@ -162,7 +165,29 @@ impl App {
             closing: stop.clone(),
         });
         let working = (!acts.is_empty()).then(|| mapper.clone() as Arc<dyn Mapper>);
-        Self::start(working, mapper, limits, stop).await
+        Self::start(working, mapper, limits, stop, true).await
+    }
+
+    /// That asks for keys, with a worker whose mapper makes models of two modules.
+    pub async fn with_keys() -> Self {
+        let stop = CancellationToken::new();
+        let acts = Mutex::new(VecDeque::from([Act::Map(2)]));
+        let mapper = Arc::new(ScriptedMapper { acts, seen: Mutex::default(), closing: stop.clone() });
+        Self::start(Some(mapper.clone()), mapper, Limits::default(), stop, false).await
+    }
+
+    /// The secret of a new key.
+    pub async fn key(&self, organisation: &str, scopes: &[Scope], plants: Option<Vec<PlantId>>) -> String {
+        let now = jiff::Timestamp::now();
+        let organisation = match self.store.create_organisation(organisation, now).await.unwrap() {
+            Created::New(organisation) | Created::Existing(organisation) => organisation.id,
+        };
+        let secret = Secret::random().unwrap();
+        let scopes = scopes.iter().copied().collect();
+        let name = "test".to_owned();
+        let new = NewKey { organisation, name, secret: secret.record(), scopes, plants, expires: None };
+        self.store.create_key(&new, now).await.unwrap();
+        secret.reveal().to_owned()
     }
 
     /// With a worker that maps in earnest, by this detector.
@@ -170,7 +195,7 @@ impl App {
         let stop = CancellationToken::new();
         let unused = Arc::new(ScriptedMapper { acts: Mutex::default(), seen: Mutex::default(), closing: stop.clone() });
         let mapper = PipelineMapper::new(Box::new(move || Ok(detector.clone())));
-        Self::start(Some(Arc::new(mapper)), unused, Limits::default(), stop).await
+        Self::start(Some(Arc::new(mapper)), unused, Limits::default(), stop, true).await
     }
 
     async fn start(
@@ -178,6 +203,7 @@ impl App {
         mapper: Arc<ScriptedMapper>,
         limits: Limits,
         stop: CancellationToken,
+        insecure: bool,
     ) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let store: Arc<dyn Store> = Arc::new(SqliteStore::open(&folder.path().join("heliomap.db")).await.unwrap());
@@ -202,13 +228,17 @@ impl App {
         }
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
         let base = format!("http://{}", listener.local_addr().unwrap());
-        let app = router(AppState { store, blobs, limits: Arc::new(limits), bell });
+        let app = router(AppState { store: store.clone(), blobs, limits: Arc::new(limits), bell, insecure });
         tokio::spawn(axum::serve(listener, app).with_graceful_shutdown(stop.clone().cancelled_owned()).into_future());
-        Self { base, client: Client::new(), mapper, folder, _stop: stop.drop_guard() }
+        Self { base, client: Client::new(), mapper, folder, store, secret: None, _stop: stop.drop_guard() }
     }
 
     pub fn request(&self, method: Method, path: &str) -> RequestBuilder {
-        self.client.request(method, format!("{}{path}", self.base))
+        let request = self.client.request(method, format!("{}{path}", self.base));
+        match &self.secret {
+            Some(secret) => request.bearer_auth(secret),
+            None => request,
+        }
     }
 
     pub async fn get(&self, path: &str) -> (StatusCode, Value) {

@@ -1,5 +1,6 @@
 //! The HTTP API in process: real store, real worker, a mapper that does as it is told.
 
+mod access;
 mod app;
 #[path = "../common/boxes.rs"]
 mod boxes;
@@ -10,3 +11,4 @@ mod jobs;
 mod models;
 mod plants;
 mod reconstruction;
+mod tenants;

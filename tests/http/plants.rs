@@ -46,10 +46,9 @@ async fn deleting_a_plant_deletes_everything_of_it() {
     let plant = crate::app::plant_path(&survey);
     let blobs = app.folder.path().join("blobs/plants");
     assert_eq!(std::fs::read_dir(&blobs).unwrap().count(), 1);
-    for _ in 0..2 {
-        let answer = json_of(app.request(Method::DELETE, plant).send().await.unwrap()).await;
-        assert_eq!(answer.0, StatusCode::NO_CONTENT);
-    }
+    let delete = async || json_of(app.request(Method::DELETE, plant).send().await.unwrap()).await;
+    assert_eq!(delete().await.0, StatusCode::NO_CONTENT);
+    assert_problem(delete().await, 404, "plant_not_found", "");
     assert_eq!(std::fs::read_dir(&blobs).unwrap().count(), 0);
     assert_problem(app.get(plant).await, 404, "plant_not_found", "");
     assert_problem(app.get(&survey).await, 404, "plant_not_found", "");

@@ -49,7 +49,7 @@ fn start(data: &Path, arguments: &[&str]) -> (Program, String) {
 }
 
 fn serve(data: &Path, more: &[&str]) -> (Program, String) {
-    let (program, line) = start(data, &[&["serve", "--listen", "127.0.0.1:0"], more].concat());
+    let (program, line) = start(data, &[&["serve", "--insecure", "--listen", "127.0.0.1:0"], more].concat());
     let base = line.trim().strip_prefix("heliomap is listening on ").expect("the address is printed");
     (program, base.to_owned())
 }
@@ -136,6 +136,31 @@ fn a_broken_reconstruction_fails_its_job() {
     let message = job["error"]["message"].as_str().unwrap();
     assert!(message.starts_with("reconstruction.json is not what OpenSfM writes"), "{message}");
     assert!(message.ends_with("export it again"), "{message}");
+}
+
+#[test]
+fn without_a_key_nobody_gets_in() {
+    let data = tempfile::tempdir().unwrap();
+    let keys = |arguments: &[&str]| {
+        let arguments = [&["keys", "--data-dir", data.path().to_str().unwrap()], arguments].concat();
+        let output = Command::new(env!("CARGO_BIN_EXE_heliomap")).args(arguments).output().unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        String::from_utf8(output.stdout).unwrap().trim().to_owned()
+    };
+    let secret = keys(&["create", "--name", "first", "--scope", "admin"]);
+    let (_program, line) = start(data.path(), &["serve", "--no-worker", "--listen", "127.0.0.1:0"]);
+    let plants = format!("{}/api/v1/plants", line.trim().strip_prefix("heliomap is listening on ").unwrap());
+    let client = Client::new();
+    let status = |secret: &str| client.get(&plants).bearer_auth(secret).send().unwrap().status();
+    assert_eq!(client.get(&plants).send().unwrap().status(), StatusCode::UNAUTHORIZED);
+    assert_eq!((status("hm_wrong"), status(&secret)), (StatusCode::UNAUTHORIZED, StatusCode::OK));
+    let listed = keys(&["list"]);
+    assert!(!listed.contains(&secret) && listed.contains(&secret[..11]), "{listed}");
+    let id = listed.split(' ').next().unwrap();
+    let rotated = keys(&["rotate", id]);
+    assert_eq!((status(&secret), status(&rotated)), (StatusCode::UNAUTHORIZED, StatusCode::OK));
+    keys(&["revoke", id]);
+    assert_eq!(status(&rotated), StatusCode::UNAUTHORIZED);
 }
 
 #[test]

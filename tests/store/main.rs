@@ -21,6 +21,9 @@ macro_rules! on_sqlite {
 }
 
 on_sqlite!(
+    organisations_and_their_plants,
+    keys,
+    audit_log,
     plants_and_surveys,
     files_all_or_none,
     one_unfinished_job_per_survey,
@@ -36,16 +39,50 @@ on_sqlite!(
     boxes_find_what_touches_them,
 );
 
+/// A data folder of before there were organisations keeps all that it holds.
+#[tokio::test]
+async fn what_was_there_before_is_kept() {
+    use heliomap::store::{OrganisationId, Page, Store};
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("heliomap.db");
+    let options = sqlx::sqlite::SqliteConnectOptions::new().filename(&file).create_if_missing(true);
+    let pool = sqlx::SqlitePool::connect_with(options).await.unwrap();
+    let mut migrator = sqlx::migrate!("migrations/sqlite");
+    migrator.migrations.to_mut().truncate(1);
+    migrator.run(&pool).await.unwrap();
+    let (plant, survey) = ("11111111-1111-4111-8111-111111111111", "22222222-2222-4222-8222-222222222222");
+    for (statement, id) in [
+        ("INSERT INTO plants (id, name, created_ms) VALUES ($1, 'A', 1)", plant),
+        (
+            "INSERT INTO surveys (id, plant_id, name, created_ms) VALUES ($1, (SELECT id FROM plants), 'June', 1)",
+            survey,
+        ),
+    ] {
+        sqlx::query(statement).bind(id).execute(&pool).await.unwrap();
+    }
+    pool.close().await;
+    let store = SqliteStore::open(&file).await.unwrap();
+    let all = Page { after: None, limit: 9 };
+    let plants = store.plants(OrganisationId::DEFAULT, None, all).await.unwrap();
+    assert_eq!((plants.len(), plants[0].id.to_string().as_str()), (1, plant));
+    assert_eq!(store.surveys(plants[0].id, all).await.unwrap().len(), 1);
+    assert!(store.delete_plant(plants[0].id).await.unwrap());
+    assert!(store.surveys(plants[0].id, all).await.unwrap().is_empty());
+}
+
 #[tokio::test]
 async fn rows_survive_the_process_and_two_may_open_at_once() {
-    use heliomap::store::{Created, Store};
+    use heliomap::store::{Created, OrganisationId, Store};
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("heliomap.db");
     let (first, second) = tokio::join!(SqliteStore::open(&file), SqliteStore::open(&file));
     let now = jiff::Timestamp::UNIX_EPOCH;
-    let created = first.unwrap().create_plant("A", now).await.unwrap();
+    let created = first.unwrap().create_plant(OrganisationId::DEFAULT, "A", now).await.unwrap();
     assert!(matches!(created, Created::New(_)));
-    assert!(matches!(second.unwrap().create_plant("A", now).await.unwrap(), Created::Existing(_)));
+    assert!(matches!(
+        second.unwrap().create_plant(OrganisationId::DEFAULT, "A", now).await.unwrap(),
+        Created::Existing(_)
+    ));
     let again = SqliteStore::open(&file).await.unwrap();
-    assert!(matches!(again.create_plant("A", now).await.unwrap(), Created::Existing(_)));
+    assert!(matches!(again.create_plant(OrganisationId::DEFAULT, "A", now).await.unwrap(), Created::Existing(_)));
 }

@@ -112,14 +112,21 @@ export class Problem extends Error {
   }
 }
 
+/** Where the key lies until the tab is closed. */
+const KEY = "heliomap-key";
+
+/** From now on requests show this key. */
+export const useKey = (key: string) => sessionStorage.setItem(KEY, key);
+
 const ROOT = "/api/v1";
 /** Modules per request. */
 const PART = 5000;
 
 async function request<T>(path: string, init: RequestInit = {}): Promise<T> {
   let response: Response;
+  const key = sessionStorage.getItem(KEY);
   try {
-    response = await fetch(path, init);
+    response = await fetch(path, key ? { ...init, headers: { authorization: `Bearer ${key}` } } : init);
   } catch (error) {
     if (init.signal?.aborted) throw error;
     throw new Problem("The service does not answer", "Check that it runs and that the network is up.", "unreachable");

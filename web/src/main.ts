@@ -8,6 +8,7 @@ import {
   type ModelDetail,
   type ModuleProperties,
   Problem,
+  useKey,
 } from "./api";
 import { type ColorBy, legend } from "./colors";
 import { moduleDetails } from "./details";
@@ -57,12 +58,27 @@ async function attempt(action: () => Promise<void>): Promise<void> {
     place.hidden = true;
   } catch (error) {
     if (error instanceof DOMException && error.name === "AbortError") return;
-    const retry = h("button", { type: "button", click: () => void attempt(action) }, "Try again");
-    const code = error instanceof Problem ? h("code", {}, error.code) : undefined;
-    place.replaceChildren(h("span", {}, told(error)), ...(code ? [code] : []), retry);
+    if (error instanceof Problem && error.code === "unauthorized") {
+      place.replaceChildren(askForKey(() => void attempt(action)));
+    } else {
+      const retry = h("button", { type: "button", click: () => void attempt(action) }, "Try again");
+      const code = error instanceof Problem ? h("code", {}, error.code) : undefined;
+      place.replaceChildren(h("span", {}, told(error)), ...(code ? [code] : []), retry);
+    }
     place.hidden = false;
     status.textContent = "";
   }
+}
+
+/** A form for the key that the service asks for. */
+function askForKey(then: () => void): HTMLFormElement {
+  const key = h("input", { type: "password", "aria-label": "Key", placeholder: "hm_…", autocomplete: "off", required: true });
+  const go = (event: Event) => {
+    event.preventDefault();
+    useKey(key.value.trim());
+    then();
+  };
+  return h("form", { submit: go }, h("span", {}, "This service asks for a key that may read. "), key, h("button", {}, "Go on"));
 }
 
 function remember(): void {

@@ -1,0 +1,289 @@
+//! Who may do what. Every request to a described operation passes here: what its `security` says in the API's description
+//! is what is asked for, so that an operation that says nothing lets nobody in.
+
+use super::AppState;
+use super::error::{ApiError, Code};
+use super::intake::receive::drain;
+use crate::plant::PlantId;
+use crate::store::{ApiKey, AuditEntry, Digest, KeyId, OrganisationId, Scope};
+use axum::extract::{FromRequestParts, MatchedPath, RawPathParams, Request, State};
+use axum::http::request::Parts;
+use axum::http::{HeaderMap, Method, header};
+use axum::middleware::Next;
+use axum::response::{IntoResponse, Response};
+use jiff::{SignedDuration, Timestamp};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::sync::Arc;
+use tower_http::request_id::RequestId;
+use utoipa::openapi::security::{HttpAuthScheme, HttpBuilder, SecurityScheme};
+use utoipa::openapi::{ContentBuilder, OpenApi, Ref, ResponseBuilder};
+
+/// The name of the one way in, in the API's description.
+const SCHEME: &str = "key";
+
+/// How exact the time of a key's last use is.
+const LAST_USE_GRAIN: SignedDuration = SignedDuration::from_mins(1);
+
+/// Who sent a request.
+#[derive(Debug, Clone)]
+pub struct Caller {
+    pub organisation: OrganisationId,
+    /// The key and its name; none where the service asks for no keys.
+    pub key: Option<(KeyId, String)>,
+    pub scopes: BTreeSet<Scope>,
+    /// The plants that the caller may see; all of the organisation's where there is no list.
+    pub plants: Option<Vec<PlantId>>,
+}
+
+impl Caller {
+    /// Whoever sends requests where the service asks for no keys.
+    fn anyone() -> Self {
+        let (organisation, scopes) = (OrganisationId::DEFAULT, BTreeSet::from([Scope::Admin]));
+        Self { organisation, key: None, scopes, plants: None }
+    }
+
+    /// Refuses a caller whose key is for some plants only.
+    pub fn require_all_plants(&self) -> Result<(), ApiError> {
+        match self.plants {
+            None => Ok(()),
+            Some(_) => {
+                Err(ApiError::new(Code::Forbidden, "this key is for some plants only; use one without that limit"))
+            }
+        }
+    }
+
+    fn may_see(&self, plant: PlantId) -> bool {
+        self.plants.as_ref().is_none_or(|plants| plants.contains(&plant))
+    }
+}
+
+impl From<ApiKey> for Caller {
+    fn from(key: ApiKey) -> Self {
+        Self { organisation: key.organisation, key: Some((key.id, key.name)), scopes: key.scopes, plants: key.plants }
+    }
+}
+
+impl<S: Sync> FromRequestParts<S> for Caller {
+    type Rejection = ApiError;
+
+    async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self, ApiError> {
+        parts.extensions.get::<Self>().cloned().ok_or_else(unknown_caller)
+    }
+}
+
+/// What an operation asks for.
+#[derive(Debug, Clone, PartialEq, Eq)]
+enum Need {
+    /// Open to everyone.
+    Nothing,
+    /// One of these scopes, or that of administrators.
+    OneOf(BTreeSet<Scope>),
+}
+
+/// What every operation asks for, by path and method.
+#[derive(Debug)]
+pub struct Policy(HashMap<String, BTreeMap<String, Need>>);
+
+impl Policy {
+    /// Reads the policy out of the description.
+    pub fn of(description: &OpenApi) -> Self {
+        let document = serde_json::to_value(description).unwrap_or_default();
+        let mut policy = HashMap::new();
+        for (path, operations) in document["paths"].as_object().into_iter().flatten() {
+            let needs: &mut BTreeMap<String, Need> = policy.entry(path.clone()).or_default();
+            for (method, operation) in operations.as_object().into_iter().flatten() {
+                let alternatives = operation["security"].as_array().into_iter().flatten();
+                let names: Vec<_> = alternatives.map(|alternative| alternative[SCHEME].as_array()).collect();
+                let need = match names.as_slice() {
+                    [None] => Need::Nothing,
+                    names => {
+                        let words = names.iter().flatten().copied().flatten().filter_map(|word| word.as_str());
+                        Need::OneOf(words.filter_map(|word| word.parse().ok()).collect())
+                    }
+                };
+                needs.insert(method.to_ascii_uppercase(), need);
+            }
+        }
+        Self(policy)
+    }
+
+    fn need(&self, method: &Method, path: &str) -> Result<&Need, ApiError> {
+        let needs = self.0.get(path);
+        let method = if method == Method::HEAD { &Method::GET } else { method };
+        needs.and_then(|needs| needs.get(method.as_str())).ok_or_else(|| {
+            let allowed: Vec<&str> = needs.into_iter().flatten().map(|(method, _)| method.as_str()).collect();
+            ApiError::new(Code::MethodNotAllowed, format!("{path} takes {}", allowed.join(", ")))
+                .with("allow", allowed.join(","))
+        })
+    }
+}
+
+/// Adds what the guard answers to the description of every operation that it guards.
+pub fn describe(description: &mut OpenApi) {
+    let components = description.components.get_or_insert_default();
+    let scheme = HttpBuilder::new()
+        .scheme(HttpAuthScheme::Bearer)
+        .description(Some(
+            "A key of this service: `Authorization: Bearer hm_…`. Each operation names the scopes that open it, of which \
+             one is enough; `admin` opens all.",
+        ))
+        .build();
+    components.add_security_scheme(SCHEME, SecurityScheme::Http(scheme));
+    let problem = |text: &str| {
+        let content = ContentBuilder::new().schema(Some(Ref::from_schema_name("Problem"))).build();
+        ResponseBuilder::new().description(text).content("application/problem+json", content).build()
+    };
+    for item in description.paths.paths.values_mut() {
+        let operations =
+            [&mut item.get, &mut item.put, &mut item.post, &mut item.delete, &mut item.patch, &mut item.head];
+        for operation in operations.into_iter().flatten() {
+            if operation.security.as_ref().is_some_and(|needs| needs.iter().all(|need| *need != Default::default())) {
+                let responses = &mut operation.responses.responses;
+                responses.insert("401".to_owned(), problem("`unauthorized`: no key, or none that is good").into());
+                responses.insert("403".to_owned(), problem("`forbidden`: the key does not open this").into());
+            }
+        }
+    }
+}
+
+/// What the guard knows.
+#[derive(Clone)]
+pub struct Gate {
+    pub state: AppState,
+    pub policy: Arc<Policy>,
+}
+
+/// Lets a request through, or says why not; notes in the audit log what changes something, or was refused.
+pub async fn guard(
+    State(gate): State<Gate>,
+    path: MatchedPath,
+    parameters: RawPathParams,
+    mut request: Request,
+    next: Next,
+) -> Response {
+    let need = match gate.policy.need(request.method(), path.as_str()) {
+        Ok(Need::Nothing) => return next.run(request).await,
+        Ok(Need::OneOf(scopes)) => scopes,
+        Err(problem) => {
+            let allow = problem.members["allow"].as_str().unwrap_or_default().to_owned();
+            return ([(header::ALLOW, allow)], problem).into_response();
+        }
+    };
+    let caller = match gate.caller(request.headers()).await {
+        Ok(caller) => caller,
+        Err(problem) => return refuse(request, problem).await,
+    };
+    let changes = !matches!(*request.method(), Method::GET | Method::HEAD);
+    let mut entry = AuditEntry {
+        organisation: caller.organisation,
+        at: Timestamp::now(),
+        key: caller.key.clone(),
+        method: request.method().to_string(),
+        path: request.uri().path().to_owned(),
+        status: 0,
+        request_id: request_id(&request).to_owned(),
+    };
+    let allowed = gate.allow(&caller, need, &parameters).await;
+    let refused = allowed.is_err();
+    let response = match allowed {
+        Ok(()) => {
+            request.extensions_mut().insert(caller);
+            next.run(request).await
+        }
+        Err(problem) => refuse(request, problem).await,
+    };
+    if changes || refused {
+        entry.status = response.status().as_u16();
+        if let Err(error) = gate.state.store.record(&entry).await {
+            tracing::error!(%error, ?entry, "the audit log cannot be written");
+        }
+    }
+    response
+}
+
+impl Gate {
+    /// Who sent a request with these headers.
+    async fn caller(&self, headers: &HeaderMap) -> Result<Caller, ApiError> {
+        if self.state.insecure {
+            return Ok(Caller::anyone());
+        }
+        let bearer = headers.get(header::AUTHORIZATION).and_then(|value| value.to_str().ok()?.split_once(' '));
+        let secret =
+            bearer.filter(|(scheme, _)| scheme.eq_ignore_ascii_case("bearer")).map(|(_, secret)| secret.trim());
+        let now = Timestamp::now();
+        let found = match secret {
+            Some(secret) => self.state.store.key_of_secret(Digest::of(secret.as_bytes()), now).await?,
+            None => None,
+        };
+        let key = found.ok_or_else(unknown_caller)?;
+        if key.last_used.is_none_or(|last| now.duration_since(last) >= LAST_USE_GRAIN)
+            && let Err(error) = self.state.store.key_used(key.id, now).await
+        {
+            tracing::warn!(%error, key = %key.id, "the key's last use cannot be noted");
+        }
+        Ok(key.into())
+    }
+
+    /// Whether a caller may do what asks for one of these scopes. What the caller may not see is not there.
+    async fn allow(&self, caller: &Caller, need: &BTreeSet<Scope>, parameters: &RawPathParams) -> Result<(), ApiError> {
+        for (name, value) in parameters {
+            if name == "plant" {
+                let plant: PlantId = value.parse().map_err(|_| {
+                    ApiError::new(Code::NotFound, format!("`{value}` names no plant; identifiers are UUIDs"))
+                })?;
+                let owned = self.state.store.plant(plant).await?.filter(|p| p.organisation == caller.organisation);
+                if owned.is_none() || !caller.may_see(plant) {
+                    return Err(AppState::no_plant(plant));
+                }
+            }
+        }
+        if caller.scopes.contains(&Scope::Admin) || !caller.scopes.is_disjoint(need) {
+            return Ok(());
+        }
+        let words: Vec<&str> = need.iter().map(|scope| scope.as_str()).chain(["admin"]).collect();
+        let detail = format!("this takes a key with one of the scopes {}", words.join(", "));
+        Err(ApiError::new(Code::Forbidden, detail))
+    }
+}
+
+/// Answers a problem, once what the client is sending was taken off the line within reason.
+async fn refuse(request: Request, problem: ApiError) -> Response {
+    drain(request.into_body().into_data_stream(), &problem).await;
+    let challenge = (problem.code == Code::Unauthorized).then_some([(header::WWW_AUTHENTICATE, "Bearer")]);
+    (challenge, problem).into_response()
+}
+
+fn unknown_caller() -> ApiError {
+    ApiError::new(
+        Code::Unauthorized,
+        "send a key that is neither expired nor revoked as `authorization: Bearer hm_…`; an administrator of yours makes one \
+         with POST /api/v1/keys, whoever runs the service makes the first with `heliomap keys create`",
+    )
+}
+
+/// What the request is called in the log.
+pub fn request_id(request: &Request) -> &str {
+    request.extensions().get::<RequestId>().and_then(|id| id.header_value().to_str().ok()).unwrap_or("")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::http::openapi;
+
+    #[test]
+    fn only_what_says_nothing_of_anyone_is_open() {
+        let policy = Policy::of(&openapi());
+        let mut open: Vec<&str> = Vec::new();
+        for (path, needs) in &policy.0 {
+            for need in needs.values() {
+                match need {
+                    Need::Nothing => open.push(path),
+                    Need::OneOf(scopes) => assert!(!scopes.is_empty(), "{path} says not who may use it"),
+                }
+            }
+        }
+        open.sort();
+        assert_eq!(open, ["/health", "/openapi.json", "/openapi.yaml", "/ready"]);
+    }
+}

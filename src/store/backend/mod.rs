@@ -1,0 +1,444 @@
+//! The methods of the store, written once for both databases: this module is compiled once beside each of them and knows
+//! its database by the names `Rows` (the store), `Row` and `Tx` of its parent.
+
+mod access;
+mod read;
+
+use super::super::sql;
+use super::super::{
+    Cancelled, Claim, Completed, Created, Ending, Enqueued, Feature, FeatureQuery, FileRecord, FileWritten, GeoBox,
+    Heartbeat, Job, JobId, JobRequest, LayerInfo, Model, NewFeature, NewModel, OrganisationId, Page, Plant, Progress,
+    Store, StoreError, Survey, SurveyId,
+};
+use super::{Rows, Tx};
+use crate::plant::{Layer, ModuleId, PlantId};
+use async_trait::async_trait;
+use jiff::Timestamp;
+use read::{file, job, model, plant, survey};
+use sqlx::Row as _;
+use std::time::Duration;
+use uuid::Uuid;
+
+/// A box that covers less of its layer than this is looked up by place.
+const SMALL_BOX_SHARE: f64 = 0.05;
+
+#[async_trait]
+impl Store for Rows {
+    async fn ping(&self) -> Result<(), StoreError> {
+        sqlx::query(sql::PING).execute(&self.read).await?;
+        Ok(())
+    }
+
+    async fn create_plant(
+        &self,
+        organisation: OrganisationId,
+        name: &str,
+        now: Timestamp,
+    ) -> Result<Created<Plant>, StoreError> {
+        let mut tx = self.begin().await?;
+        let row = sqlx::query(sql::CREATE_PLANT)
+            .bind(Uuid::new_v4().to_string())
+            .bind(organisation.to_string())
+            .bind(name)
+            .bind(now.as_millisecond())
+            .fetch_optional(&mut *tx)
+            .await
+            .map_err(gone("organisation"))?;
+        let created = match row {
+            Some(row) => Created::New(plant(&row)?),
+            None => {
+                let query = sqlx::query(sql::PLANT_BY_NAME).bind(organisation.to_string()).bind(name);
+                Created::Existing(plant(&query.fetch_one(&mut *tx).await?)?)
+            }
+        };
+        tx.commit().await?;
+        Ok(created)
+    }
+
+    async fn plant(&self, id: PlantId) -> Result<Option<Plant>, StoreError> {
+        let row = sqlx::query(sql::PLANT).bind(id.to_string()).fetch_optional(&self.read).await?;
+        row.as_ref().map(plant).transpose()
+    }
+
+    async fn plants(
+        &self,
+        organisation: OrganisationId,
+        only: Option<&[PlantId]>,
+        page: Page,
+    ) -> Result<Vec<Plant>, StoreError> {
+        let query = sqlx::query(sql::PLANTS)
+            .bind(organisation.to_string())
+            .bind(only.map(access::plants_text))
+            .bind(page.after.unwrap_or(0))
+            .bind(i64::from(page.limit));
+        query.fetch_all(&self.read).await?.iter().map(plant).collect()
+    }
+
+    async fn delete_plant(&self, id: PlantId) -> Result<bool, StoreError> {
+        let done = sqlx::query(sql::DELETE_PLANT).bind(id.to_string()).execute(&self.write).await?;
+        Ok(done.rows_affected() > 0)
+    }
+
+    async fn create_survey(&self, plant: PlantId, name: &str, now: Timestamp) -> Result<Created<Survey>, StoreError> {
+        let mut tx = self.begin().await?;
+        let row = sqlx::query(sql::CREATE_SURVEY)
+            .bind(Uuid::new_v4().to_string())
+            .bind(plant.to_string())
+            .bind(name)
+            .bind(now.as_millisecond())
+            .fetch_optional(&mut *tx)
+            .await
+            .map_err(gone("plant"))?;
+        let created = match row {
+            Some(row) => Created::New(survey(&row)?),
+            None => {
+                let query = sqlx::query(sql::SURVEY_BY_NAME).bind(plant.to_string()).bind(name);
+                Created::Existing(survey(&query.fetch_one(&mut *tx).await?)?)
+            }
+        };
+        tx.commit().await?;
+        Ok(created)
+    }
+
+    async fn survey(&self, plant: PlantId, id: SurveyId) -> Result<Option<Survey>, StoreError> {
+        let query = sqlx::query(sql::SURVEY).bind(plant.to_string()).bind(id.to_string());
+        query.fetch_optional(&self.read).await?.as_ref().map(survey).transpose()
+    }
+
+    async fn surveys(&self, plant: PlantId, page: Page) -> Result<Vec<Survey>, StoreError> {
+        let query =
+            sqlx::query(sql::SURVEYS).bind(plant.to_string()).bind(page.after.unwrap_or(0)).bind(i64::from(page.limit));
+        query.fetch_all(&self.read).await?.iter().map(survey).collect()
+    }
+
+    async fn put_files(&self, survey: SurveyId, files: &[FileRecord]) -> Result<Vec<FileWritten>, StoreError> {
+        let mut tx = self.begin().await?;
+        let mut written = Vec::with_capacity(files.len());
+        for file in files {
+            let before: Option<String> = sqlx::query_scalar(sql::FILE_DIGEST)
+                .bind(survey.to_string())
+                .bind(file.path.as_str())
+                .fetch_optional(&mut *tx)
+                .await?;
+            let digest = file.sha256.to_string();
+            let verdict = match before {
+                Some(before) if before == digest => FileWritten::Unchanged,
+                Some(_) => FileWritten::Replaced,
+                None => FileWritten::Created,
+            };
+            if verdict != FileWritten::Unchanged {
+                sqlx::query(sql::PUT_FILE)
+                    .bind(survey.to_string())
+                    .bind(file.path.as_str())
+                    .bind(file.path.kind().as_str())
+                    .bind(file.size as i64)
+                    .bind(digest)
+                    .bind(file.size_px.map(|size| i64::from(size[0])))
+                    .bind(file.size_px.map(|size| i64::from(size[1])))
+                    .bind(file.stored.as_millisecond())
+                    .execute(&mut *tx)
+                    .await
+                    .map_err(gone("survey"))?;
+            }
+            written.push(verdict);
+        }
+        tx.commit().await?;
+        Ok(written)
+    }
+
+    async fn files(&self, survey: SurveyId) -> Result<Vec<FileRecord>, StoreError> {
+        let rows = sqlx::query(sql::FILES).bind(survey.to_string()).fetch_all(&self.read).await?;
+        rows.iter().map(file).collect()
+    }
+
+    async fn enqueue_job(&self, request: &JobRequest, now: Timestamp) -> Result<Enqueued, StoreError> {
+        let mut tx = self.begin().await?;
+        let row = sqlx::query(sql::ENQUEUE_JOB)
+            .bind(Uuid::new_v4().to_string())
+            .bind(request.plant.to_string())
+            .bind(request.survey.to_string())
+            .bind(&request.options)
+            .bind(i64::from(request.max_attempts))
+            .bind(now.as_millisecond())
+            .fetch_optional(&mut *tx)
+            .await
+            .map_err(gone("survey"))?;
+        let enqueued = match row {
+            Some(row) => Enqueued::New(job(&row)?),
+            None => {
+                let query = sqlx::query(sql::UNFINISHED_JOB).bind(request.survey.to_string());
+                Enqueued::Existing(job(&query.fetch_one(&mut *tx).await?)?)
+            }
+        };
+        tx.commit().await?;
+        Ok(enqueued)
+    }
+
+    async fn job(&self, plant: PlantId, id: JobId) -> Result<Option<Job>, StoreError> {
+        let query = sqlx::query(sql::JOB).bind(plant.to_string()).bind(id.to_string());
+        query.fetch_optional(&self.read).await?.as_ref().map(job).transpose()
+    }
+
+    async fn jobs(&self, plant: PlantId, survey: Option<SurveyId>, page: Page) -> Result<Vec<Job>, StoreError> {
+        let statement = if survey.is_some() { sql::JOBS_OF_SURVEY } else { sql::JOBS_OF_PLANT };
+        let mut query = sqlx::query(statement)
+            .bind(plant.to_string())
+            .bind(page.after.unwrap_or(i64::MAX))
+            .bind(i64::from(page.limit));
+        if let Some(survey) = survey {
+            query = query.bind(survey.to_string());
+        }
+        query.fetch_all(&self.read).await?.iter().map(job).collect()
+    }
+
+    async fn cancel_job(&self, plant: PlantId, id: JobId, now: Timestamp) -> Result<Option<Cancelled>, StoreError> {
+        let mut tx = self.begin().await?;
+        let query = sqlx::query(sql::CANCEL_JOB).bind(plant.to_string()).bind(id.to_string());
+        let row = query.bind(now.as_millisecond()).fetch_optional(&mut *tx).await?;
+        let outcome = match row {
+            Some(row) => Some(Cancelled::Accepted(job(&row)?)),
+            None => {
+                let query = sqlx::query(sql::JOB).bind(plant.to_string()).bind(id.to_string());
+                let row = query.fetch_optional(&mut *tx).await?;
+                row.as_ref().map(job).transpose()?.map(Cancelled::TooLate)
+            }
+        };
+        tx.commit().await?;
+        Ok(outcome)
+    }
+
+    async fn claim_job(&self, worker: &str, lease: Duration, now: Timestamp) -> Result<Option<Claim>, StoreError> {
+        let mut tx = self.begin().await?;
+        sqlx::query(sql::BURY_ABANDONED_JOBS)
+            .bind(now.as_millisecond())
+            .bind("every worker that took this job fell silent; see the workers' logs, then start a new job")
+            .execute(&mut *tx)
+            .await?;
+        let row = sqlx::query(sql::CLAIM_JOB)
+            .bind(worker)
+            .bind(now.as_millisecond())
+            .bind(after(now, lease))
+            .fetch_optional(&mut *tx)
+            .await?;
+        let claim = row.map(|row| Ok::<_, StoreError>(Claim { job: job(&row)?, fence: row.try_get("fence")? }));
+        let claim = claim.transpose()?;
+        tx.commit().await?;
+        Ok(claim)
+    }
+
+    async fn heartbeat(
+        &self,
+        claim: &Claim,
+        progress: Option<Progress>,
+        lease: Duration,
+        now: Timestamp,
+    ) -> Result<Heartbeat, StoreError> {
+        let cancel: Option<bool> = sqlx::query_scalar(sql::HEARTBEAT)
+            .bind(claim.job.id.to_string())
+            .bind(claim.fence)
+            .bind(after(now, lease))
+            .bind(progress.as_ref().map(|progress| progress.stage.clone()))
+            .bind(progress.as_ref().map(|progress| progress.done as i64))
+            .bind(progress.as_ref().map(|progress| progress.total as i64))
+            .fetch_optional(&self.write)
+            .await?;
+        Ok(match cancel {
+            None => Heartbeat::Lost,
+            Some(true) => Heartbeat::Cancel,
+            Some(false) => Heartbeat::Continue,
+        })
+    }
+
+    async fn complete_job(&self, claim: &Claim, new: &NewModel, now: Timestamp) -> Result<Completed, StoreError> {
+        let mut tx = self.begin().await?;
+        let warnings = serde_json::json!(new.warnings).to_string();
+        let done = sqlx::query(sql::COMPLETE_JOB)
+            .bind(claim.job.id.to_string())
+            .bind(claim.fence)
+            .bind(now.as_millisecond())
+            .bind(&warnings)
+            .bind(i64::from(new.version))
+            .execute(&mut *tx)
+            .await?;
+        if done.rows_affected() == 0 {
+            return Ok(Completed::Fenced);
+        }
+        let row = sqlx::query(sql::INSERT_MODEL)
+            .bind(claim.job.plant.to_string())
+            .bind(i64::from(new.version))
+            .bind(claim.job.survey.to_string())
+            .bind(claim.job.id.to_string())
+            .bind(new.sha256.to_string())
+            .bind(new.size as i64)
+            .bind(&warnings)
+            .bind(now.as_millisecond())
+            .fetch_optional(&mut *tx)
+            .await?;
+        let Some(row) = row else {
+            return Ok(Completed::Outdated);
+        };
+        let stored = model(&row)?;
+        for layer in &new.layers {
+            let extents = || layer.features.iter().filter_map(|feature| feature.extent);
+            let extent = extents().reduce(GeoBox::union);
+            sqlx::query(sql::INSERT_LAYER)
+                .bind(stored.seq)
+                .bind(layer.layer.as_str())
+                .bind(layer.features.len() as i64)
+                .bind(&layer.properties)
+                .bind(extent.map(|b| b.min_lon))
+                .bind(extent.map(|b| b.min_lat))
+                .bind(extent.map(|b| b.max_lon))
+                .bind(extent.map(|b| b.max_lat))
+                .bind(extents().map(GeoBox::height_deg).fold(0.0, f64::max))
+                .execute(&mut *tx)
+                .await?;
+            for (index, feature) in layer.features.iter().enumerate() {
+                insert_feature(&mut tx, stored.seq, layer.layer, index as i64 + 1, feature).await?;
+            }
+        }
+        tx.commit().await?;
+        Ok(Completed::Done(Box::new(stored)))
+    }
+
+    async fn end_job(&self, claim: &Claim, ending: &Ending, now: Timestamp) -> Result<bool, StoreError> {
+        let now_ms = Some(now.as_millisecond());
+        let exhausted = claim.job.attempt >= claim.job.max_attempts;
+        let (state, code, message, run_after_ms, finished_ms, attempts_back) = match ending {
+            Ending::Failed { code, message } => ("failed", Some(code), Some(message), None, now_ms, 0),
+            Ending::Retry { code, message, .. } if exhausted => ("failed", Some(code), Some(message), None, now_ms, 0),
+            Ending::Retry { code, message, at } => {
+                ("queued", Some(code), Some(message), Some(at.as_millisecond()), None, 0)
+            }
+            Ending::Cancelled => ("cancelled", None, None, None, now_ms, 0),
+            Ending::Released => ("queued", None, None, now_ms, None, 1),
+        };
+        let done = sqlx::query(sql::END_JOB)
+            .bind(claim.job.id.to_string())
+            .bind(claim.fence)
+            .bind(state)
+            .bind(code)
+            .bind(message)
+            .bind(run_after_ms)
+            .bind(finished_ms)
+            .bind(attempts_back)
+            .execute(&self.write)
+            .await?;
+        Ok(done.rows_affected() > 0)
+    }
+
+    async fn models(&self, plant: PlantId, page: Page) -> Result<Vec<Model>, StoreError> {
+        let query = sqlx::query(sql::MODELS)
+            .bind(plant.to_string())
+            .bind(page.after.unwrap_or(i64::MAX))
+            .bind(i64::from(page.limit));
+        query.fetch_all(&self.read).await?.iter().map(model).collect()
+    }
+
+    async fn model(&self, plant: PlantId, version: Option<u32>) -> Result<Option<Model>, StoreError> {
+        let query = match version {
+            Some(version) => sqlx::query(sql::MODEL).bind(plant.to_string()).bind(i64::from(version)),
+            None => sqlx::query(sql::NEWEST_MODEL).bind(plant.to_string()),
+        };
+        query.fetch_optional(&self.read).await?.as_ref().map(model).transpose()
+    }
+
+    async fn layer(&self, model: &Model, layer: Layer) -> Result<Option<LayerInfo>, StoreError> {
+        let query = sqlx::query(sql::LAYER).bind(model.seq).bind(layer.as_str());
+        let Some(row) = query.fetch_optional(&self.read).await? else { return Ok(None) };
+        let min_lon: Option<f64> = row.try_get("min_lon")?;
+        let extent = match min_lon {
+            Some(min_lon) => Some(GeoBox {
+                min_lon,
+                min_lat: row.try_get("min_lat")?,
+                max_lon: row.try_get("max_lon")?,
+                max_lat: row.try_get("max_lat")?,
+            }),
+            None => None,
+        };
+        Ok(Some(LayerInfo {
+            model_seq: model.seq,
+            layer,
+            features: row.try_get::<i64, _>("features")? as u64,
+            properties: row.try_get("properties")?,
+            extent,
+            tallest_deg: row.try_get("tallest_deg")?,
+        }))
+    }
+
+    async fn features(&self, layer: &LayerInfo, page: FeatureQuery) -> Result<Vec<Feature>, StoreError> {
+        let small = |within: GeoBox| {
+            let share = |covered: f64, whole: f64| if whole > 0.0 { (covered / whole).clamp(0.0, 1.0) } else { 1.0 };
+            layer.extent.is_none_or(|extent| {
+                share(within.max_lon - within.min_lon, extent.max_lon - extent.min_lon)
+                    * share(within.height_deg(), extent.height_deg())
+                    < SMALL_BOX_SHARE
+            })
+        };
+        let statement = match page.within {
+            None => sql::FEATURES,
+            Some(within) if small(within) => sql::FEATURES_IN_SMALL_BOX,
+            Some(_) => sql::FEATURES_IN_LARGE_BOX,
+        };
+        let mut query = sqlx::query(statement)
+            .bind(layer.model_seq)
+            .bind(layer.layer.as_str())
+            .bind(page.after.unwrap_or(0))
+            .bind(i64::from(page.limit));
+        if let Some(within) = page.within {
+            query = query.bind(within.min_lon).bind(within.min_lat).bind(within.max_lon).bind(within.max_lat);
+            if small(within) {
+                query = query.bind(within.min_lat - layer.tallest_deg);
+            }
+        }
+        let rows = query.fetch_all(&self.read).await?;
+        rows.iter().map(|row| Ok(Feature { seq: row.try_get("seq")?, json: row.try_get("feature")? })).collect()
+    }
+
+    async fn module(&self, model: &Model, id: ModuleId) -> Result<Option<String>, StoreError> {
+        let query = sqlx::query_scalar(sql::MODULE).bind(id.to_string()).bind(model.seq);
+        Ok(query.fetch_optional(&self.read).await?)
+    }
+
+    async fn module_last_seen(&self, plant: PlantId, id: ModuleId) -> Result<Option<u32>, StoreError> {
+        let query = sqlx::query_scalar(sql::MODULE_LAST_SEEN).bind(id.to_string()).bind(plant.to_string());
+        let version: Option<i64> = query.fetch_optional(&self.read).await?;
+        version.map(|version| read::small("version", version)).transpose()
+    }
+}
+
+async fn insert_feature(
+    tx: &mut Tx,
+    model_seq: i64,
+    layer: Layer,
+    seq: i64,
+    feature: &NewFeature,
+) -> Result<(), StoreError> {
+    sqlx::query(sql::INSERT_FEATURE)
+        .bind(model_seq)
+        .bind(layer.as_str())
+        .bind(seq)
+        .bind(&feature.id)
+        .bind(&feature.label)
+        .bind(&feature.json)
+        .bind(feature.extent.map(|b| b.min_lon))
+        .bind(feature.extent.map(|b| b.min_lat))
+        .bind(feature.extent.map(|b| b.max_lon))
+        .bind(feature.extent.map(|b| b.max_lat))
+        .execute(&mut **tx)
+        .await?;
+    Ok(())
+}
+
+/// Milliseconds at the end of a lease that begins now.
+fn after(now: Timestamp, lease: Duration) -> i64 {
+    now.as_millisecond().saturating_add(i64::try_from(lease.as_millis()).unwrap_or(i64::MAX))
+}
+
+/// A row whose owner was deleted meanwhile cannot be written.
+fn gone(what: &'static str) -> impl FnOnce(sqlx::Error) -> StoreError {
+    move |error| match &error {
+        sqlx::Error::Database(database) if database.is_foreign_key_violation() => StoreError::Gone { what },
+        _ => StoreError::Database(error),
+    }
+}
