@@ -40,7 +40,7 @@ def shares(photos: list[Photo]) -> np.ndarray:
 class Stream(IterableDataset):
     """Yields image (3, s, s) float and what `targets` makes of the modules' quadrilaterals.
 
-    `sources` are (share, photos) pairs; what is left of 1 is drawn. Drawn pictures are used about twice, each time
+    `sources` are (share, photos) pairs; what is left of 1 is drawn. Drawn pictures are used about three times, each time
     turned and finished differently.
     """
 
@@ -72,7 +72,7 @@ class Stream(IterableDataset):
                 break
             r -= share
         else:
-            if len(recent) < 24 or rng.random() < 0.5:
+            if len(recent) < 24 or rng.random() < 0.35:
                 image, quads = draw(rng, self.size, SHORT_SIDE)
                 recent.append((image, quads))
             else:

@@ -1,7 +1,8 @@
 """Measures a model: `python -m training.evaluate --model models/unet.onnx [--card models/unet.md]`.
 
 Recall, precision at IoU 0.5 of oriented boxes against the modules wholly inside the frame (what is cut by the frame
-or lies in an ignored area counts neither way), mean IoU, median centre error, splits, merges, per plant and frame.
+or lies in an ignored area counts neither way), mean IoU, median centre error, splits, merges, per plant and frame, and on
+the validation plants per condition. Modules under glare count apart.
 """
 
 from __future__ import annotations
@@ -16,10 +17,24 @@ import cv2
 import numpy as np
 
 from . import instances, sources
+from .card import GLARE_SHARE, write_card
 from .postprocess import Box, boxes, overlap, quad_area, touches_frame
 from .runner import Runner, resample
 from .sources import Photo
 from .targets import CORE_SHRINK, GSD, GSD_RANGE
+
+
+GLARE_LEVEL = 250  # of all three channels
+
+# Conditions of a rendered plant by which the validation is told apart.
+CONDITIONS = {
+    "dusty": lambda c: c["dirt"] > 0.1,
+    "low sun (below 25 degrees)": lambda c: c["sun"]["elevation"] < 25,
+    "haze": lambda c: c["finish"]["haze"] > 0.05,
+    "blurred": lambda c: c["finish"]["blur"] > 0.7,
+    "motion blur": lambda c: c["finish"]["motion"] > 0,
+    "noisy": lambda c: c["finish"]["noise"] > 3,
+}
 
 
 @dataclass
@@ -35,9 +50,11 @@ class Score:
     ious: list[float] = field(default_factory=list)
     errors: list[float] = field(default_factory=list)
     worst: float = 1.0
+    glared: int = 0
+    glared_found: int = 0
 
     def add(self, o: "Score") -> None:
-        for k in ("truth", "found", "boxes", "false", "splits", "merges"):
+        for k in ("truth", "found", "boxes", "false", "splits", "merges", "glared", "glared_found"):
             setattr(self, k, getattr(self, k) + getattr(o, k))
         self.ious += o.ious
         self.errors += o.errors
@@ -62,6 +79,8 @@ class Score:
             "center_px": round(float(np.median(self.errors)), 3) if self.errors else None,
             "splits": self.splits,
             "merges": self.merges,
+            "glared": self.glared,
+            "glared_found": self.glared_found,
         }
 
 
@@ -69,12 +88,28 @@ def inside(quads: np.ndarray, w: int, h: int) -> np.ndarray:
     return ((quads >= -0.5) & (quads <= np.array([w - 0.5, h - 0.5]))).all(axis=(1, 2))
 
 
+def under_glare(photo: Photo) -> np.ndarray:
+    """Modules of whose pixels more than GLARE_SHARE are saturated."""
+    white = (photo.image.min(axis=2) >= GLARE_LEVEL).astype(np.uint8)
+    out = np.zeros(len(photo.quads), bool)
+    h, w = white.shape
+    for i, q in enumerate(photo.quads):
+        x0, y0 = np.clip(np.floor(q.min(axis=0)).astype(int), 0, (w - 1, h - 1))
+        x1, y1 = np.clip(np.ceil(q.max(axis=0)).astype(int) + 1, 1, (w, h))
+        mask = np.zeros((y1 - y0, x1 - x0), np.uint8)
+        if mask.size:
+            cv2.fillConvexPoly(mask, np.round((q - (x0, y0)) * 16).astype(np.int32), 1, cv2.LINE_8, 4)
+            out[i] = (white[y0:y1, x0:x1] * mask).sum() > GLARE_SHARE * max(1, mask.sum())
+    return out
+
+
 def compare(photo: Photo, found: list[Box], scale: float = 1.0) -> Score:
     """Greedy matching by IoU. Boxes are in the photo's own pixels."""
     h, w = photo.image.shape[:2]
     ins = inside(photo.quads, w, h)
     found = [b for b in found if not touches_frame(b, w, h)]
-    s = Score(truth=int(ins.sum()))
+    glare = under_glare(photo)
+    s = Score(truth=int((ins & ~glare).sum()), glared=int((ins & glare).sum()))
     centers = photo.quads.mean(axis=1) if len(photo.quads) else np.zeros((0, 2))
     pairs = []
     for j, b in enumerate(found):
@@ -96,7 +131,9 @@ def compare(photo: Photo, found: list[Box], scale: float = 1.0) -> Score:
             continue
         used_i.add(i)
         used_j.add(j)
-        if ins[i]:
+        if ins[i] and glare[i]:
+            s.glared_found += 1
+        elif ins[i]:
             s.found += 1
             s.boxes += 1
             s.ious.append(iou)
@@ -108,11 +145,11 @@ def compare(photo: Photo, found: list[Box], scale: float = 1.0) -> Score:
         if any(cv2.pointPolygonTest(g.astype(np.float32), p, False) >= 0 for g in photo.ignore):
             continue
         hit = [i for _, i, k in pairs if k == j and cv2.pointPolygonTest(photo.quads[i].astype(np.float32), p, False) >= 0]
-        if hit and not ins[hit[0]]:
-            continue  # on a module that the frame cuts
+        if hit and (glare[hit[0]] or not ins[hit[0]]):
+            continue  # on a module that the frame cuts, or that has no outline to be compared with
         s.boxes += 1
         s.false += 1
-    for i in np.nonzero(ins)[0]:
+    for i in np.nonzero(ins & ~glare)[0]:
         q = photo.quads[i].astype(np.float32)
         s.splits += sum(cv2.pointPolygonTest(q, (float(b.center[0]), float(b.center[1])), False) >= 0 for b in found) > 1
     s.worst = s.recall
@@ -129,6 +166,27 @@ def detect(runner: Runner, photo: Photo, scale: float = 1.0, shrink: float = COR
         b.center = (b.center + 0.5) * size - 0.5
         b.u, b.v = b.u * size, b.v * size
     return found, out
+
+
+def morphology(runner: Runner, photo: Photo, scale: float = 1.0) -> tuple[list[Box], np.ndarray]:
+    """Boxes from the face mask alone, the paper's way: threshold, erosion, segments, rectangles, dilation. For comparison."""
+    image = resample(photo.image, scale)
+    prob = runner(image)
+    mask = cv2.erode((prob[0] > 0.5).astype(np.uint8), np.ones((3, 3), np.uint8))
+    contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    size = np.array(photo.image.shape[1::-1]) / np.array(image.shape[1::-1])
+    found = []
+    for c in contours:
+        (x, y), (w, h), angle = cv2.minAreaRect(c)
+        if len(c) < 5 or min(w, h) < 2:
+            continue
+        a = np.deg2rad(angle)
+        # A pixel for the outline through the pixels' centres, two for the erosion.
+        u, v = np.array([np.cos(a), np.sin(a)]) * (w + 3), np.array([-np.sin(a), np.cos(a)]) * (h + 3)
+        u, v = (u, v) if w >= h else (v, -u)
+        found.append(Box((np.array([x, y]) + 0.5) * size - 0.5, u * size, v * size, 1.0))
+    median = np.median([b.area for b in found]) if found else 0
+    return [b for b in found if 0.45 * median < b.area < 2 * median], prob
 
 
 def working_scale(gsd: float | None) -> float:
@@ -153,6 +211,22 @@ def overlay(photo: Photo, found: list[Box], path: Path, truth: bool = True) -> N
     cv2.imwrite(str(path), img)
 
 
+def validation(runner: Runner, find=detect) -> dict[str, dict]:
+    """Rows of the validation plants: all, per style, per condition, per size of a module."""
+    sums: dict[str, Score] = {"all": Score()}
+    for photo in sources.renders("validation"):
+        scale = working_scale(photo.gsd)
+        found, _ = find(runner, photo, scale)
+        score = compare(photo, found)
+        px = photo.module_px * scale
+        size = "under 16 px" if px < 16 else "16 to 26 px" if px < 26 else "26 px and more"
+        names = ["all", photo.conditions["style"], f"short side {size}"]
+        names += [name for name, holds in CONDITIONS.items() if holds(photo.conditions)]
+        for name in names:
+            sums.setdefault(name, Score()).add(score)
+    return {name: sums[name].row() for name in sorted(sums)}
+
+
 def test_sets() -> dict[str, list[tuple[Photo, float]]]:
     """Name of the set to its photos and the scale at which each is run."""
     sets: dict[str, list[tuple[Photo, float]]] = {}
@@ -174,20 +248,29 @@ def test_sets() -> dict[str, list[tuple[Photo, float]]]:
 def main() -> None:
     p = argparse.ArgumentParser(description=__doc__)
     p.add_argument("--model", type=Path, default=Path("models/unet.onnx"), help=".onnx, or a checkpoint .pt")
+    p.add_argument("--kind", choices=("unet", "yolo"), default="unet", help="of a checkpoint")
     p.add_argument("--card", type=Path, help="write the model card here")
     p.add_argument("--overlay", type=Path, help="write overlays into this folder")
+    p.add_argument("--validation", action="store_true", help="only the validation plants")
+    p.add_argument("--morphology", action="store_true", help="boxes from the face mask alone, for comparison")
     p.add_argument("--only", help="only sets whose name contains this")
     p.add_argument("--threads", type=int, default=2)
     a = p.parse_args()
     cv2.setNumThreads(a.threads)
-    runner = Runner(a.model, a.threads)
+    runner = Runner(a.model, a.threads, a.kind)
+    find = morphology if a.morphology else detect
     rows: dict[str, dict] = {}
+    conditions = validation(runner, find) if a.validation or a.card else {}
+    for name, row in conditions.items():
+        print(f"validation, {name}", json.dumps(row), flush=True)
+    if a.validation:
+        return
     for name, photos in test_sets().items():
         if a.only and a.only not in name:
             continue
         total = Score()
         for photo, scale in photos:
-            found, _ = detect(runner, photo, scale)
+            found, _ = find(runner, photo, scale)
             total.add(compare(photo, found))
             if a.overlay:
                 a.overlay.mkdir(parents=True, exist_ok=True)
@@ -204,9 +287,7 @@ def main() -> None:
     per_mp = min(times) / (x.shape[0] * x.shape[1] / 1e6)
     print(f"{per_mp:.3f} (median {np.median(times) / (x.shape[0] * x.shape[1] / 1e6):.3f}) s per megapixel, {a.threads} threads")
     if a.card:
-        from .card import write_card
-
-        write_card(a.card, a.model, runner.meta, rows, per_mp, a.threads)
+        write_card(a.card, a.model, runner.meta, rows, conditions, per_mp, a.threads)
 
 
 if __name__ == "__main__":
