@@ -130,6 +130,7 @@ class Style:
         self.cell_gap = rng.uniform(0.002, 0.012) * (1 if kind in ("poly", "mono") else 0.4)
         if rng.random() < 0.15:
             self.cell_gap = rng.uniform(0.01, 0.022)
+        self.gap_ratio = 1.0  # gaps across the short side, against those across the long side
         # The cut corners of mono cells leave bright diamonds.
         self.chamfer = rng.uniform(0.01, 0.035) if kind in ("mono", "black") and rng.random() < 0.6 else 0.0
         self.bus_gap = rng.uniform(0.001, 0.003)
@@ -164,9 +165,13 @@ class Style:
     def camouflage(self, rng: Rng):
         """Cell grids brighter than all else; frames and seams narrow and dark, or of the grid's mean colour."""
         self.cell_color = rgb(0.85, 0.87, 0.92) * rng.uniform(0.6, 1.2)
-        self.cell_gap = rng.uniform(0.003, 0.016) * (0.7 if self.halfcut else 1.0)
+        # Up to a third of a cell, as wide as cameras blur it and renders draw it.
+        self.cell_gap = np.exp(rng.uniform(np.log(0.004), np.log(0.05)))
         self.bus_count = int(rng.choice([0, 0, 2, 3]))
-        share = min(0.5, 2 * self.cell_gap * self.cells[0] / self.size[0])
+        self.gap_ratio = 1.0 if rng.random() < 0.4 else rng.uniform(0.2, 1.0)
+        if self.halfcut:
+            self.cell_gap *= 0.6
+        share = min(0.6, (1 + self.gap_ratio) * self.cell_gap * self.cells[0] / self.size[0])
         grid = self.color * (1 - share) + self.cell_color * share
         r = rng.random()
         self.frame_color = rgb(0.05, 0.05, 0.06) * rng.uniform(0.6, 2) if r < 0.5 else grid * rng.uniform(0.6, 1.1) if r < 0.8 else self.frame_color
@@ -207,7 +212,8 @@ def bench_texture(s: Style, rng: Rng, cols: int, rows: int, texel: float):
         wide_p = integrate(stripes(span, seam_c, wide), texel, count) if len(seam_c) else seam_p
         frame_p = family(lambda st: (np.array([st + s.frame / 2, st + m - s.frame / 2]), s.frame), starts, span, count)
         margin_p = family(lambda st: (np.array([st + s.frame + s.margin / 2, st + m - s.frame - s.margin / 2]), s.margin), starts, span, count)
-        cell_p = family(lambda st: (lines(st + inner0, inner, cells), s.cell_gap), starts, span, count) if cells > 1 else np.zeros(count, np.float32)
+        gap = s.cell_gap * (s.gap_ratio if along_short else 1.0)
+        cell_p = family(lambda st: (lines(st + inner0, inner, cells), gap), starts, span, count) if cells > 1 else np.zeros(count, np.float32)
         bus = max(1, s.bus_count) * cells
         bus_p = np.zeros(count, np.float32)
         if s.bus_count and s.kind != "thin" and along_short != s.bus_across:
@@ -217,7 +223,7 @@ def bench_texture(s: Style, rng: Rng, cols: int, rows: int, texel: float):
             half_p = family(lambda st: (np.array([st + m / 2]), s.half_gap), starts, span, count)
         notch_p = np.zeros(count, np.float32)
         if s.chamfer and cells > 1:
-            notch_p = family(lambda st: (lines(st + inner0, inner, cells), s.cell_gap + s.chamfer), starts, span, count)
+            notch_p = family(lambda st: (lines(st + inner0, inner, cells), gap + s.chamfer), starts, span, count)
         return seam_p, wide_p, frame_p, margin_p, cell_p, bus_p, half_p, notch_p
 
     short_u = not s.landscape
@@ -389,7 +395,7 @@ def bench_shadow(rng: Rng, n: int, polys: list[np.ndarray], rows: int, pitch: fl
     shade = poly_mask(n, [onto(p) for p in polys])
     light = np.zeros((n, n), np.uint8)
     widths = [int(v) for v in rng.integers(1, 4, 2)]
-    axes = (rng.random() < 0.85, rng.random() < 0.5)
+    axes = (rng.random() < 0.7, rng.random() < 0.8)
     for p in polys:
         cols = max(1, round(float(np.linalg.norm(p[1] - p[0])) / pitch))
         f, g = np.arange(1, rows)[:, None] / rows, np.arange(1, cols)[:, None] / cols
@@ -531,7 +537,7 @@ def draw(rng: Rng, size: int, short_side: tuple[float, float], empty: float = 0.
             e = axis * nc * (mw + style.seam[0])
             u = slope * bench_h
             polys.append(np.array([o, o + e, o + e + u, o + u]))
-        if rng.random() < 0.4:
+        if rng.random() < 0.25:
             shadow([cam(onto_ground(p)) for p in polys])
         else:  # light falls through the seams: a lattice on the ground that is none of modules
             x *= 1 - bench_shadow(rng, n, polys, rows, mw + style.seam[0], texel, lambda p: cam(onto_ground(p)))[..., None] * (1 - dark * sky)
