@@ -24,7 +24,7 @@ from .sources import Photo
 from .targets import CORE_SHRINK, GSD, GSD_RANGE
 
 
-GLARE_LEVEL = 235  # of all three channels
+GLARE_LEVEL = 240  # of all three channels
 
 # Conditions of a rendered plant by which the validation is told apart.
 CONDITIONS = {
