@@ -17,7 +17,7 @@ export ORT_DYLIB_PATH ?= $(abspath $(ORT_LIBRARY))
 HELIOMAP_DATA ?= $(wildcard ../shared/data)
 export HELIOMAP_DATA
 
-.PHONY: help setup web demo test lint unit structure bench openapi clean
+.PHONY: help setup web demo test lint unit kills structure bench openapi clean
 
 help: ## List the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -50,6 +50,11 @@ lint: setup ## Formatting and lints, warnings are errors
 
 unit: setup ## Tests alone
 	$(CARGO) test --locked
+
+KILLS ?= 200
+kills: setup ## Kill server and worker at random (KILLS times): nothing is lost, models are those of a run without kills
+	$(CARGO) build --locked
+	$(PYTHON) tests/kills/kills.py --binary target/debug/heliomap --kills $(KILLS)
 
 structure: setup ## Survey of every kind of simulated layout: how many come out exactly
 	$(CARGO) test --locked --test structure -- --ignored --nocapture

@@ -44,6 +44,8 @@ pub struct ServeArgs {
     #[command(flatten)]
     pub detector: DetectorArgs,
     #[command(flatten)]
+    pub jobs: JobArgs,
+    #[command(flatten)]
     pub limits: Limits,
 }
 
@@ -54,6 +56,16 @@ pub struct WorkerArgs {
     pub storage: StorageArgs,
     #[command(flatten)]
     pub detector: DetectorArgs,
+    #[command(flatten)]
+    pub jobs: JobArgs,
+}
+
+/// How jobs are run.
+#[derive(Debug, Clone, Args)]
+pub struct JobArgs {
+    /// Seconds after which a job whose worker fell silent is taken up by another.
+    #[arg(long, env = "HELIOMAP_LEASE", default_value = "30", value_parser = parse_seconds, value_name = "SECONDS")]
+    pub lease: Duration,
 }
 
 /// `heliomap keys`.
@@ -158,6 +170,9 @@ pub struct Limits {
     /// Most entries in a zip or tar, and most images in one multipart upload.
     #[arg(long, env = "HELIOMAP_MAX_ENTRIES", default_value_t = 20_000, value_name = "COUNT")]
     pub max_entries: usize,
+    /// How often a job is started without getting anywhere before it fails.
+    #[arg(long, env = "HELIOMAP_MAX_ATTEMPTS", default_value_t = 3, value_name = "COUNT")]
+    pub max_attempts: u32,
     /// How long an upload may stand still, and any other request may take, in seconds.
     #[arg(long, env = "HELIOMAP_REQUEST_TIMEOUT", default_value = "30", value_parser = parse_seconds, value_name = "SECONDS")]
     pub request_timeout: Duration,
@@ -173,6 +188,7 @@ impl Default for Limits {
             max_unpacked_size: 64 << 30,
             max_unpacked_ratio: 50,
             max_entries: 20_000,
+            max_attempts: 3,
             request_timeout: Duration::from_secs(30),
         }
     }

@@ -137,6 +137,19 @@ pub trait Observer: Sync {
     fn cancelled(&self) -> bool {
         false
     }
+    /// What an earlier run of this very mapping (equal input, options and program) found in an image.
+    fn recall(&self, _image: &str) -> Option<Found> {
+        None
+    }
+    /// Told of what was found in an image, for a later run to recall.
+    fn found(&self, _found: &Found) {}
+}
+
+/// What one image shows.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Found {
+    pub detections: ImageDetections,
+    pub layout: Layout,
 }
 
 /// What one stage cost.
@@ -413,11 +426,14 @@ fn search_images(
     let observer = clock.observer;
     let start = Instant::now();
     let total = chosen.len();
-    observer.progress(Stage::Detect, 0, total);
-    let (seen, layout_time) = std::thread::scope(|scope| -> Result<(Vec<Seen>, Duration), MapError> {
+    let (mut seen, sought): (Vec<Seen>, Vec<usize>) = recalled(project, chosen, observer);
+    let known = seen.len();
+    observer.progress(Stage::Detect, known, total);
+    let (fresh, layout_time) = std::thread::scope(|scope| -> Result<(Vec<Seen>, Duration), MapError> {
         let (decoded_sender, decoded) = sync_channel(1);
+        let sought = &sought;
         scope.spawn(move || {
-            for &shot in chosen {
+            for &shot in sought {
                 let image = project.photos[shot].load();
                 if decoded_sender.send((shot, image)).is_err() {
                     break;
@@ -426,13 +442,15 @@ fn search_images(
         });
         let (found_sender, found) = sync_channel::<(usize, image::RgbImage, ImageDetections)>(1);
         let laying_out = scope.spawn(move || {
-            let mut seen = Vec::with_capacity(total);
+            let mut seen = Vec::with_capacity(sought.len());
             let mut spent = Duration::ZERO;
             for (shot, image, detections) in found {
                 let start = Instant::now();
                 let grey = image::imageops::grayscale(&image);
                 let layout = layout::infer(&detections, Some(&grey), &LayoutOptions::default());
-                seen.push(Seen { shot, detections, layout });
+                let found = Found { detections, layout };
+                observer.found(&found);
+                seen.push(Seen { shot, detections: found.detections, layout: found.layout });
                 spent += start.elapsed();
             }
             (seen, spent)
@@ -451,18 +469,32 @@ fn search_images(
             if found_sender.send((shot, image, detections)).is_err() {
                 break;
             }
-            observer.progress(Stage::Detect, done + 1, total);
+            observer.progress(Stage::Detect, known + done + 1, total);
         }
         drop(found_sender);
         laying_out
             .join()
             .map_err(|_| MapError::Environment { message: "laying out an image failed unexpectedly".to_owned() })
     })?;
+    seen.extend(fresh);
+    seen.sort_by_key(|seen| seen.shot);
     let wall = start.elapsed();
     clock.add(Stage::Detect, wall.saturating_sub(layout_time));
     clock.add(Stage::Layout, layout_time);
     observer.progress(Stage::Layout, total, total);
     Ok(seen)
+}
+
+/// What an earlier run found in these shots, and the shots in which it had not looked.
+fn recalled(project: &Project, chosen: &[usize], observer: &dyn Observer) -> (Vec<Seen>, Vec<usize>) {
+    let (mut seen, mut sought) = (Vec::new(), Vec::new());
+    for &shot in chosen {
+        match observer.recall(&project.reconstruction.shots[shot].name) {
+            Some(found) => seen.push(Seen { shot, detections: found.detections, layout: found.layout }),
+            None => sought.push(shot),
+        }
+    }
+    (seen, sought)
 }
 
 /// Takes the boxes of a file instead of searching; images are decoded only to look at the ground between modules.

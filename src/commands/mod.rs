@@ -8,10 +8,11 @@ pub mod serve;
 pub mod worker;
 
 use anyhow::Context;
-use heliomap::config::{DetectorArgs, StorageArgs};
+use heliomap::config::{DetectorArgs, JobArgs, StorageArgs};
 use heliomap::detection::{DetectionError, Detector, Unet};
 use heliomap::jobs::{PipelineMapper, Worker, WorkerSettings};
 use heliomap::store::{Blobs, SqliteStore, Store};
+use jiff::Timestamp;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
@@ -31,17 +32,28 @@ async fn open_storage(args: &StorageArgs) -> anyhow::Result<(Arc<dyn Store>, Blo
     let blobs = Blobs::in_folder(folder).with_context(hint)?;
     blobs.sweep_staging(STALE_UPLOADS).await.with_context(hint)?;
     let store = SqliteStore::open(&folder.join("heliomap.db")).await.with_context(hint)?;
+    // A plant may have been deleted without its blobs, or while some were still coming.
+    for plant in store.deleted_plants().await? {
+        blobs.delete_plant(plant).await?;
+    }
+    store.forget_deleted_plants(Timestamp::now() - STALE_UPLOADS).await?;
     Ok((Arc::new(store), blobs))
 }
 
 /// A worker that runs the pipeline.
-fn pipeline_worker(store: Arc<dyn Store>, blobs: Blobs, detector: DetectorArgs, bell: Arc<Notify>) -> Worker {
+fn pipeline_worker(
+    store: Arc<dyn Store>,
+    blobs: Blobs,
+    detector: DetectorArgs,
+    jobs: &JobArgs,
+    bell: Arc<Notify>,
+) -> Worker {
     Worker {
         name: format!("{}-{}", std::process::id(), &uuid::Uuid::new_v4().simple().to_string()[..8]),
         store,
         blobs,
         mapper: Arc::new(PipelineMapper::new(Box::new(move || open_detector(&detector.detector)))),
-        settings: WorkerSettings::default(),
+        settings: WorkerSettings::with_lease(jobs.lease),
         bell,
     }
 }

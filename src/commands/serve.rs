@@ -26,7 +26,7 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
             .with_context(|| format!("cannot listen on {}; choose another address with --listen", args.listen))?;
         let address = listener.local_addr()?;
 
-        let worker = pipeline_worker(store.clone(), blobs.clone(), args.detector, bell.clone());
+        let worker = pipeline_worker(store.clone(), blobs.clone(), args.detector, &args.jobs, bell.clone());
         let worker_stop = stop.clone();
         let working = (!args.no_worker).then(|| tokio::spawn(async move { worker.run(worker_stop).await }));
 
@@ -35,6 +35,7 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
             blobs,
             limits: Arc::new(args.limits),
             bell,
+            stop: stop.clone(),
             insecure: args.insecure,
         });
         let shutdown = stop.clone().cancelled_owned();

@@ -10,7 +10,7 @@ pub fn run(args: WorkerArgs) -> anyhow::Result<()> {
     run_async(async {
         let (store, blobs) = open_storage(&args.storage).await?;
         let stop = stop_signal()?;
-        let worker = pipeline_worker(store, blobs, args.detector, Arc::new(Notify::new()));
+        let worker = pipeline_worker(store, blobs, args.detector, &args.jobs, Arc::new(Notify::new()));
         println!("heliomap works on jobs in {}", args.storage.data_dir.display());
         let work = worker.run(stop.clone());
         tokio::pin!(work);

@@ -16,9 +16,6 @@ use axum::response::{IntoResponse, Response};
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
-/// How often a job is started before it fails for good.
-const MAX_ATTEMPTS: u32 = 3;
-
 /// What a mapping may be told; every member may be left out.
 #[derive(Debug, Default, Deserialize, utoipa::ToSchema)]
 #[serde(default, deny_unknown_fields)]
@@ -35,6 +32,9 @@ pub struct StartJob {
     pub spacing_m: Option<[f64; 2]>,
     /// Seed of every random choice, 1 where it is not given.
     pub seed: Option<u64>,
+    /// Among waiting jobs the highest is taken first; 0 where it is not given.
+    #[schema(minimum = -100, maximum = 100)]
+    pub priority: Option<i32>,
 }
 
 impl StartJob {
@@ -46,6 +46,9 @@ impl StartJob {
         }
         if self.max_gsd_m_per_px.as_ref().is_some_and(|gsd| !positive(gsd)) {
             return refuse("max_gsd_m_per_px must be positive; leave it out to have it chosen from the images");
+        }
+        if self.priority.is_some_and(|priority| !(-100..=100).contains(&priority)) {
+            return refuse("priority must be -100 to 100; leave it out for 0");
         }
         if self.spacing_m.as_ref().is_some_and(|spacing| !spacing.iter().all(positive)) {
             return refuse("spacing_m must be two positive numbers of metres; leave it out where it is not known");
@@ -84,7 +87,10 @@ pub struct JobView {
     pub error: Option<JobErrorView>,
     /// How often it was started.
     pub attempt: u32,
+    /// How often it is started without getting anywhere before it fails.
     pub max_attempts: u32,
+    /// Among waiting jobs the highest is taken first.
+    pub priority: i32,
     pub options: serde_json::Value,
     /// Where its model is, once it has succeeded.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -115,6 +121,10 @@ pub struct ProgressView {
     pub done: u64,
     /// Units of this stage.
     pub total: u64,
+    /// Seconds until the job ends, by the pace of this stage and what the later ones took in the last job; left out while
+    /// that cannot be told.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub remaining_s: Option<u64>,
 }
 
 /// Why a job failed.
@@ -159,11 +169,13 @@ impl From<Job> for JobView {
                 stage: progress.stage,
                 done: progress.done,
                 total: progress.total,
+                remaining_s: progress.remaining_ms.map(|ms| ms.div_ceil(1000)),
             }),
             warnings: job.warnings.into_iter().map(WarningView::from).collect(),
             error: job.error.map(|(code, message)| JobErrorView { code, message }),
             attempt: job.attempt,
             max_attempts: job.max_attempts,
+            priority: job.priority,
             options: serde_json::from_str(&job.options).unwrap_or_default(),
             model: job.model_version.map(|version| format!("/api/v1/plants/{}/models/{version}", job.plant)),
             model_version: job.model_version,
@@ -216,6 +228,7 @@ pub async fn start(
             })?
             .unwrap_or_default()
     };
+    let priority = asked.priority.unwrap_or(0);
     let options = asked.into_options()?;
     state.require_survey(plant, survey).await?;
     let missing = missing_views(&state.store.files(survey).await?);
@@ -224,7 +237,7 @@ pub async fn start(
         return Err(ApiError::new(Code::SurveyIncomplete, what.join("; ")).with("missing", missing));
     }
     let options = serde_json::json!(options).to_string();
-    let request = JobRequest { plant, survey, options, max_attempts: MAX_ATTEMPTS };
+    let request = JobRequest { plant, survey, options, priority, max_attempts: state.limits.max_attempts };
     let (status, job) = match state.store.enqueue_job(&request, Timestamp::now()).await? {
         Enqueued::New(job) => {
             state.bell.notify_one();
@@ -297,7 +310,7 @@ pub async fn list(
 
 /// One job: poll it until its state is final
 ///
-/// While it is not, the header `retry-after` says after how many seconds to ask again.
+/// While it is not, the header `retry-after` says after how many seconds to ask again. `GET …/events` tells as it happens.
 #[utoipa::path(
     get,
     path = "/api/v1/plants/{plant}/jobs/{job}",
@@ -317,7 +330,7 @@ pub async fn get(
     State(state): State<AppState>,
     ApiPath((plant, job)): ApiPath<(PlantId, JobId)>,
 ) -> Result<Response, ApiError> {
-    let Some(found) = state.store.job(plant, job).await? else { return Err(no_job(&state, plant, job).await?) };
+    let found = require_job(&state, plant, job).await?;
     let retry_after = (!found.state.is_final()).then_some([(header::RETRY_AFTER, "1")]);
     Ok((retry_after, Json(JobView::from(found))).into_response())
 }
@@ -356,6 +369,14 @@ pub async fn cancel(
             format!("the job is {} and cannot be cancelled any more", job.state.as_str()),
         )),
         None => Err(no_job(&state, plant, job).await?),
+    }
+}
+
+/// The job of the plant, or a problem.
+pub async fn require_job(state: &AppState, plant: PlantId, job: JobId) -> Result<Job, ApiError> {
+    match state.store.job(plant, job).await? {
+        Some(job) => Ok(job),
+        None => Err(no_job(state, plant, job).await?),
     }
 }
 

@@ -5,6 +5,7 @@ pub mod router;
 pub mod state;
 
 mod docs;
+mod events;
 mod extract;
 mod features;
 mod guard;

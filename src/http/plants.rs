@@ -135,7 +135,7 @@ pub async fn get(State(state): State<AppState>, ApiPath(plant): ApiPath<PlantId>
     )
 )]
 pub async fn delete(State(state): State<AppState>, ApiPath(plant): ApiPath<PlantId>) -> Result<StatusCode, ApiError> {
-    state.store.delete_plant(plant).await?;
+    state.store.delete_plant(plant, Timestamp::now()).await?;
     state.blobs.delete_plant(plant).await?;
     Ok(StatusCode::NO_CONTENT)
 }

@@ -1,7 +1,9 @@
 //! The table of contents.
 
 use super::guard::{Gate, Policy};
-use super::{AppState, docs, error, features, guard, health, jobs, keys, models, page, plants, surveys, uploads};
+use super::{
+    AppState, docs, error, events, features, guard, health, jobs, keys, models, page, plants, surveys, uploads,
+};
 use axum::Router;
 use axum::body::Body;
 use axum::extract::{DefaultBodyLimit, Request};
@@ -57,6 +59,7 @@ fn prompt() -> OpenApiRouter<AppState> {
         .routes(routes!(jobs::list))
         .routes(routes!(jobs::get))
         .routes(routes!(jobs::cancel))
+        .routes(routes!(events::events))
         .routes(routes!(models::list))
         .routes(routes!(models::get))
         .routes(routes!(features::layer))

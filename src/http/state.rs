@@ -6,6 +6,7 @@ use crate::plant::PlantId;
 use crate::store::{Blobs, Plant, Store, Survey, SurveyId};
 use std::sync::Arc;
 use tokio::sync::Notify;
+use tokio_util::sync::CancellationToken;
 
 /// What every handler may use.
 #[derive(Clone)]
@@ -15,6 +16,8 @@ pub struct AppState {
     pub limits: Arc<Limits>,
     /// Rung when a job was queued.
     pub bell: Arc<Notify>,
+    /// Raised when the service stops: answers without an end end then.
+    pub stop: CancellationToken,
     /// Whether anyone may do anything, without a key.
     pub insecure: bool,
 }

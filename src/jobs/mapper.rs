@@ -3,8 +3,12 @@
 use crate::detection::{DetectionError, Detector};
 use crate::pipeline::{self, Boxes, MapError, MapOptions, Observer, Subject};
 use crate::plant::PlantModel;
+use crate::store::Digest;
+use sha2::{Digest as _, Sha256};
+use std::fs::File;
+use std::io::{BufRead, BufReader};
 use std::path::Path;
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, OnceLock};
 
 /// Maps the plant in a folder. Called on a thread of its own.
 pub trait Mapper: Send + Sync + 'static {
@@ -16,6 +20,9 @@ pub trait Mapper: Send + Sync + 'static {
         subject: &Subject,
         observer: &dyn Observer,
     ) -> Result<PlantModel, MapError>;
+
+    /// Tells this mapper from every other that may find something else in the same images.
+    fn identity(&self) -> Result<String, MapError>;
 }
 
 /// Opens a detector.
@@ -61,6 +68,32 @@ impl Mapper for PipelineMapper {
         }
         Ok(mapping.model)
     }
+
+    fn identity(&self) -> Result<String, MapError> {
+        Ok(format!("{} {}", program(), self.detector()?.describe()))
+    }
+}
+
+/// The digest of this program's file: any other build may find something else. One that cannot be read is like no other.
+fn program() -> &'static str {
+    static PROGRAM: OnceLock<String> = OnceLock::new();
+    PROGRAM.get_or_init(|| {
+        let digest = || -> std::io::Result<Digest> {
+            let mut file = BufReader::with_capacity(1 << 20, File::open(std::env::current_exe()?)?);
+            let mut hasher = Sha256::new();
+            loop {
+                let bytes = file.fill_buf()?;
+                if bytes.is_empty() {
+                    break;
+                }
+                hasher.update(bytes);
+                let count = bytes.len();
+                file.consume(count);
+            }
+            Ok(Digest(hasher.finalize().into()))
+        };
+        digest().map_or_else(|_| uuid::Uuid::new_v4().to_string(), |digest| digest.to_string())
+    })
 }
 
 /// Files by their names in the survey: where the worker laid them is nobody's business.

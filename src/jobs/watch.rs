@@ -1,9 +1,12 @@
 //! What the mapping thread and the worker tell each other while a job runs.
 
-use crate::pipeline::{Observer, Stage};
-use crate::store::Progress;
-use std::sync::Mutex;
+use crate::pipeline::{Found, Observer, Stage};
+use crate::store::{Checkpoint, Progress};
+use serde::{Deserialize, Serialize};
+use std::collections::{BTreeMap, HashMap};
 use std::sync::atomic::{AtomicU8, Ordering};
+use std::sync::{Mutex, MutexGuard};
+use std::time::Instant;
 
 /// Why a running job must stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -16,11 +19,50 @@ pub enum Stop {
     Lost = 3,
 }
 
-/// One job's progress and stop sign.
+/// What each stage of a mapping of so many images took.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Pace {
+    pub images: u64,
+    pub stage_ms: BTreeMap<String, u64>,
+}
+
+impl Pace {
+    /// What a stage takes for so many images.
+    fn expected_ms(&self, stage: Stage, images: u64) -> Option<u64> {
+        Some(self.stage_ms.get(stage.as_str())? * images / self.images.max(1))
+    }
+}
+
+/// What was seen of a mapping.
+#[derive(Debug, Default)]
+struct Seen {
+    now: Option<(Stage, usize, usize)>,
+    /// When each stage was first heard of, in order.
+    begun: Vec<(Stage, Instant)>,
+    images: u64,
+    /// How many images were recalled, which takes no time.
+    recalled: u64,
+}
+
+/// What a job has found, and what an earlier attempt at it had.
+#[derive(Debug, Default)]
+struct Findings {
+    fingerprint: String,
+    known: HashMap<String, Found>,
+    fresh: Vec<Checkpoint>,
+    last: Option<Pace>,
+}
+
+/// One job's progress, findings and stop sign.
 #[derive(Debug, Default)]
 pub struct Watch {
-    progress: Mutex<Option<(Stage, usize, usize)>>,
+    seen: Mutex<Seen>,
+    findings: Mutex<Findings>,
     stop: AtomicU8,
+}
+
+fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(|poisoned| poisoned.into_inner())
 }
 
 impl Watch {
@@ -43,34 +85,109 @@ impl Watch {
         }
     }
 
+    /// Tells what an earlier attempt had found under this fingerprint, and what the stages of the last job took.
+    pub fn begin(&self, fingerprint: String, known: &[Checkpoint], last: Option<Pace>) {
+        let known = known
+            .iter()
+            // One that cannot be read is found again.
+            .filter_map(|kept| Some((kept.name.clone(), ciborium::from_reader(kept.document.as_slice()).ok()?)))
+            .collect();
+        *locked(&self.findings) = Findings { fingerprint, known, fresh: Vec::new(), last };
+    }
+
+    /// What was found since the last time, and under which fingerprint.
+    pub fn take_found(&self) -> (String, Vec<Checkpoint>) {
+        let mut findings = locked(&self.findings);
+        (findings.fingerprint.clone(), std::mem::take(&mut findings.fresh))
+    }
+
     /// How far the mapping has come.
     pub fn progress(&self) -> Option<Progress> {
-        let progress = *self.progress.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
-        progress.map(|(stage, done, total)| Progress {
+        let last = locked(&self.findings).last.clone();
+        let seen = locked(&self.seen);
+        seen.now.map(|(stage, done, total)| Progress {
             stage: stage.as_str().to_owned(),
             done: done as u64,
             total: total as u64,
+            remaining_ms: seen.remaining_ms(last.as_ref(), Instant::now()),
         })
+    }
+
+    /// What the stages took; nothing where some of the images were recalled.
+    pub fn pace(&self) -> Option<Pace> {
+        let seen = locked(&self.seen);
+        if seen.recalled > 0 || seen.images == 0 {
+            return None;
+        }
+        let ends = seen.begun.iter().skip(1).map(|(_, begun)| *begun).chain([Instant::now()]);
+        let took = seen.begun.iter().zip(ends).map(|((stage, begun), end)| {
+            (stage.as_str().to_owned(), end.saturating_duration_since(*begun).as_millis() as u64)
+        });
+        Some(Pace { images: seen.images, stage_ms: took.collect() })
+    }
+}
+
+impl Seen {
+    /// Milliseconds until the end: the rest of this stage by its own pace or else the last job's, the later stages by the
+    /// last job's. `None` while a part of it is not known.
+    fn remaining_ms(&self, last: Option<&Pace>, now: Instant) -> Option<u64> {
+        let (stage, done, total) = self.now?;
+        let (_, begun) = self.begun.last()?;
+        let spent_ms = now.saturating_duration_since(*begun).as_millis() as u64;
+        let (done, total) = (done as u64, total as u64);
+        let rest_ms = match stage {
+            Stage::Detect if done > self.recalled => spent_ms * total.saturating_sub(done) / (done - self.recalled),
+            Stage::Detect => last?.expected_ms(stage, total.saturating_sub(done))?.saturating_sub(spent_ms),
+            _ => last?.expected_ms(stage, self.images)?.saturating_sub(spent_ms),
+        };
+        let later = Stage::ALL.iter().filter(|later| **later > stage);
+        let later_ms: Option<u64> = later.map(|later| last?.expected_ms(*later, self.images)).sum();
+        Some(rest_ms + later_ms?)
     }
 }
 
 impl Observer for Watch {
     fn progress(&self, stage: Stage, done: usize, total: usize) {
-        let mut progress = self.progress.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+        let mut seen = locked(&self.seen);
         // Threads report out of order: never step back.
-        if progress.is_none_or(|(before, done_before, _)| (before, done_before) <= (stage, done)) {
-            *progress = Some((stage, done, total));
+        if seen.now.is_none_or(|(before, done_before, _)| (before, done_before) <= (stage, done)) {
+            seen.now = Some((stage, done, total));
+        }
+        if seen.begun.last().is_none_or(|(last, _)| *last < stage) {
+            seen.begun.push((stage, Instant::now()));
+        }
+        if stage == Stage::Detect {
+            seen.images = total as u64;
         }
     }
 
     fn cancelled(&self) -> bool {
         self.stopped().is_some()
     }
+
+    fn recall(&self, image: &str) -> Option<Found> {
+        let found = locked(&self.findings).known.remove(image)?;
+        locked(&self.seen).recalled += 1;
+        Some(found)
+    }
+
+    fn found(&self, found: &Found) {
+        let mut document = Vec::new();
+        if ciborium::into_writer(found, &mut document).is_ok() {
+            let name = found.detections.image.clone();
+            locked(&self.findings).fresh.push(Checkpoint { name, document });
+        }
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::detection::{Detection, ImageDetections, Source};
+    use crate::geometry::Quad;
+    use crate::layout::{self, LayoutOptions};
+    use nalgebra::Vector2;
+    use std::time::Duration;
 
     #[test]
     fn progress_never_steps_back() {
@@ -90,5 +207,51 @@ mod tests {
         assert_eq!(watch.stopped(), Some(Stop::Cancelled));
         watch.stop(Stop::Lost);
         assert_eq!(watch.stopped(), Some(Stop::Lost));
+    }
+
+    #[test]
+    fn what_is_recalled_is_what_was_found_to_the_last_digit() {
+        let corner = |x: f64, y: f64| Vector2::new(100.0 + x / 3.0, 90.0 + y / 7.0);
+        let detections = (0..12).map(|k| {
+            let (x, y) = (f64::from(k % 6) * 61.0, f64::from(k / 6) * 151.0);
+            let corners = [corner(x, y), corner(x + 60.0, y), corner(x + 60.0, y + 150.0), corner(x, y + 150.0)];
+            Detection { quad: Quad { corners }, score: 0.1 + 0.2, source: Source::Unet }
+        });
+        let image = "a.jpg".to_owned();
+        let detections = ImageDetections { image, width_px: 400, height_px: 300, detections: detections.collect() };
+        let layout = layout::infer(&detections, None, &LayoutOptions::default());
+        assert!(!layout.pieces.is_empty());
+        let found = Found { detections, layout };
+        let watch = Watch::default();
+        watch.found(&found);
+        let (_, kept) = watch.take_found();
+        assert!(watch.take_found().1.is_empty());
+        let again = Watch::default();
+        again.begin("f".to_owned(), &kept, None);
+        let recalled = again.recall("a.jpg").unwrap();
+        // Debug output of a float has all its digits.
+        assert_eq!(format!("{recalled:?}"), format!("{found:?}"));
+        assert!(again.recall("a.jpg").is_none() && again.recall("b.jpg").is_none());
+    }
+
+    #[test]
+    fn remaining_time_is_told_once_it_is_known() {
+        let begun = Instant::now();
+        let mut seen = Seen {
+            now: Some((Stage::Detect, 4, 10)),
+            begun: vec![(Stage::Read, begun), (Stage::Detect, begun)],
+            images: 10,
+            recalled: 2,
+        };
+        let later = begun + Duration::from_secs(6);
+        assert_eq!(seen.remaining_ms(None, later), None);
+        let stage_ms = Stage::ALL.iter().map(|stage| (stage.as_str().to_owned(), 500)).collect();
+        let last = Pace { images: 5, stage_ms };
+        // Two images in 6 s leave 18 s for six; five later stages of 1 s each.
+        assert_eq!(seen.remaining_ms(Some(&last), later), Some(18_000 + 5_000));
+        seen.now = Some((Stage::Detect, 2, 10));
+        assert_eq!(seen.remaining_ms(Some(&last), begun), Some(800 + 5_000));
+        seen.now = Some((Stage::Assemble, 0, 1));
+        assert_eq!(seen.remaining_ms(Some(&last), later), Some(0));
     }
 }

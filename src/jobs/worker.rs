@@ -4,7 +4,7 @@ use super::watch::{Stop, Watch};
 use super::{AttemptError, Mapper, folder, rows};
 use crate::pipeline::{MapError, MapOptions, Subject};
 use crate::plant::PlantModel;
-use crate::store::{Blobs, Claim, Completed, Ending, Heartbeat, NewModel, Store, StoreError};
+use crate::store::{Blobs, Claim, Completed, Digest, Ending, FileRecord, Heartbeat, NewModel, Store, StoreError};
 use jiff::Timestamp;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -25,15 +25,25 @@ pub struct WorkerSettings {
     pub backoff: Duration,
 }
 
-impl Default for WorkerSettings {
-    fn default() -> Self {
+impl WorkerSettings {
+    /// The usual times, but for the lease.
+    pub fn with_lease(lease: Duration) -> Self {
         Self {
-            lease: Duration::from_secs(30),
-            heartbeat: Duration::from_secs(1),
+            lease,
+            heartbeat: Duration::from_secs(1).min(lease / 4),
             poll: Duration::from_secs(1),
             backoff: Duration::from_secs(5),
         }
     }
+}
+
+/// How long a mapping that was told to stop may take before its job ends without it.
+const LINGER: Duration = Duration::from_millis(300);
+
+/// What a job's findings depend on: its files, its options, and what looks at them.
+fn fingerprint(files: &[FileRecord], options: &str, mapper: &str) -> String {
+    let files: Vec<_> = files.iter().map(|file| (file.path.as_str(), file.sha256.to_string())).collect();
+    Digest::of(serde_json::json!([files, options, mapper]).to_string().as_bytes()).to_string()
 }
 
 /// Runs jobs one after the other.
@@ -78,25 +88,37 @@ impl Worker {
         let begun = Instant::now();
         tracing::info!(plant = %claim.job.plant, survey = %claim.job.survey, "job started");
         let watch = Arc::new(Watch::default());
+        let attempt = self.attempt(&claim, &watch);
+        tokio::pin!(attempt);
         let outcome = tokio::select! {
-            outcome = self.attempt(&claim, &watch) => outcome,
-            () = self.beat(&claim, &watch, stop) => unreachable!("beats until the attempt ends"),
+            outcome = &mut attempt => Some(outcome),
+            () = self.beat(&claim, &watch, stop) => None,
         };
+        let straggles = outcome.is_none();
+        let outcome = outcome.unwrap_or(Err(MapError::Cancelled.into()));
         if let Err(error) = self.settle(&claim, &watch, outcome).await {
             // The lease runs out and the job is taken up again.
             tracing::error!(%error, "cannot record the end of the job");
         }
+        if straggles && !stop.is_cancelled() {
+            // The job has ended; its thread has to, before it and the next job's share this machine.
+            let _ = attempt.await;
+        }
         tracing::info!(seconds = begun.elapsed().as_secs_f64(), "job left");
     }
 
-    /// Reports for as long as it is polled.
+    /// Reports and keeps what was found, for as long as it is polled, or until the attempt was told to stop and did not
+    /// within a moment.
     async fn beat(&self, claim: &Claim, watch: &Watch, stop: &CancellationToken) {
         let mut heard = Instant::now();
+        let mut told = false;
         loop {
+            let pause = if told { LINGER } else { self.settings.heartbeat };
             tokio::select! {
-                () = tokio::time::sleep(self.settings.heartbeat) => {}
+                () = tokio::time::sleep(pause) => {}
                 () = stop.cancelled(), if watch.stopped().is_none() => watch.stop(Stop::Shutdown),
             }
+            self.keep(claim, watch).await;
             match self.store.heartbeat(claim, watch.progress(), self.settings.lease, Timestamp::now()).await {
                 Ok(answer) => {
                     heard = Instant::now();
@@ -113,6 +135,25 @@ impl Worker {
                     }
                 }
             }
+            if watch.stopped().is_some() {
+                if told {
+                    return;
+                }
+                told = true;
+            }
+        }
+    }
+
+    /// Stores what was found since the last time. What cannot be stored is found again where the job is taken up again.
+    async fn keep(&self, claim: &Claim, watch: &Watch) {
+        let (fingerprint, found) = watch.take_found();
+        if found.is_empty() {
+            return;
+        }
+        match self.store.checkpoint(claim, &fingerprint, &found).await {
+            Ok(true) => {}
+            Ok(false) => watch.stop(Stop::Lost),
+            Err(error) => tracing::warn!(%error, "what was found so far cannot be kept"),
         }
     }
 
@@ -137,13 +178,23 @@ impl Worker {
         let version = previous.as_ref().map_or(1, |previous| previous.version + 1);
         let subject = Subject { plant: plant.id, plant_name: plant.name, survey: job.survey.to_string(), previous };
         let files = self.store.files(job.survey).await?;
+        let mapper = self.mapper.clone();
+        let identity =
+            tokio::task::spawn_blocking(move || mapper.identity()).await.map_err(|_| AttemptError::Panicked)??;
+        let fingerprint = fingerprint(&files, &job.options, &identity);
+        let known = self.store.checkpoints(job.id, &fingerprint).await?;
+        if !known.is_empty() {
+            tracing::info!(images = known.len(), "the job goes on where it was");
+        }
+        let pace = self.store.last_stage_ms().await?;
+        watch.begin(fingerprint, &known, pace.and_then(|text| serde_json::from_str(&text).ok()));
         let folder = folder::lay_out(&self.blobs, job.plant, &files).await?;
 
-        let (mapper, watch) = (self.mapper.clone(), watch.clone());
+        let (mapper, observer) = (self.mapper.clone(), watch.clone());
         let span = tracing::Span::current();
         let mapping = tokio::task::spawn_blocking(move || {
             let _entered = span.enter();
-            let mut model = mapper.map(folder.path(), &options, &subject, &*watch)?;
+            let mut model = mapper.map(folder.path(), &options, &subject, &*observer)?;
             model.version = version;
             let bytes = serde_json::to_vec(&model).map_err(std::io::Error::from)?;
             let layers = rows::layers(&model);
@@ -152,7 +203,8 @@ impl Worker {
         let (bytes, layers, warnings) = mapping.await.map_err(|_| AttemptError::Panicked)??;
         let size = bytes.len() as u64;
         let sha256 = self.blobs.put_bytes(job.plant, bytes).await?;
-        Ok(NewModel { version, sha256, size, warnings, layers })
+        let stage_ms = watch.pace().map(|pace| serde_json::json!(pace).to_string());
+        Ok(NewModel { version, sha256, size, warnings, stage_ms, layers })
     }
 
     /// Records how an attempt ended.
@@ -163,6 +215,9 @@ impl Worker {
         outcome: Result<NewModel, AttemptError>,
     ) -> Result<(), StoreError> {
         let now = Timestamp::now();
+        if outcome.is_err() {
+            self.keep(claim, watch).await;
+        }
         let ending = match (outcome, watch.stopped()) {
             (_, Some(Stop::Lost)) => {
                 tracing::warn!("the job is in other hands or gone; its result is dropped");

@@ -1,10 +1,11 @@
 //! A smooth map from lattice coordinates to the image: where the module of a column and row stands.
 
 use nalgebra::{DMatrix, DVector, Vector2};
+use serde::{Deserialize, Serialize};
 
 /// `pixel = sum of coefficient * basis(column, row)`: affine in both, and bent along the row where there are enough
 /// columns to tell (perspective, terrain).
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct LatticeMap {
     center: Vector2<f64>,
     scale: f64,

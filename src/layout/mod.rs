@@ -15,6 +15,7 @@ use crate::geometry::Quad;
 use image::GrayImage;
 pub use lattice::LatticeMap;
 use nalgebra::Vector2;
+use serde::{Deserialize, Serialize};
 
 /// What the inference may be told.
 #[derive(Debug, Clone, Copy)]
@@ -33,7 +34,7 @@ impl Default for LayoutOptions {
 }
 
 /// A place in the lattice of a piece.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Cell {
     /// 0 is the top row of the piece (as oriented in the image).
     pub row: i32,
@@ -45,7 +46,7 @@ pub struct Cell {
 }
 
 /// What bounds a piece on one side.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum End {
     /// The next module would lie wholly inside the image, and none is there.
     Closed,
@@ -54,7 +55,7 @@ pub enum End {
 }
 
 /// The part of one bench that one image shows. Cells are sorted by row and column; both start at 0.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Piece {
     pub rows: i32,
     pub cols: i32,
@@ -83,7 +84,7 @@ impl Piece {
 }
 
 /// A visually significant keypoint: the gap between two benches of one line, at one row (equation 2).
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Gap {
     /// Piece and cell on the left.
     pub west: (usize, i32, i32),
@@ -98,7 +99,7 @@ pub struct Gap {
 }
 
 /// The structure seen in one image.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Layout {
     pub image: String,
     pub width_px: u32,

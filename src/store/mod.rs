@@ -15,8 +15,8 @@ mod sql;
 pub use access::{AccessStore, ApiKey, AuditEntry, KeyId, NewKey, Organisation, OrganisationId, Scope, SecretRecord};
 pub use blobs::{Blobs, Digest, StagedFile};
 pub use records::{
-    Cancelled, Claim, Completed, Created, Ending, Enqueued, Feature, FeatureQuery, FileRecord, FileWritten, GeoBox,
-    Heartbeat, Job, JobId, JobRequest, JobState, LayerInfo, Model, NewFeature, NewLayer, NewModel, Page, Plant,
+    Cancelled, Checkpoint, Claim, Completed, Created, Ending, Enqueued, Feature, FeatureQuery, FileRecord, FileWritten,
+    GeoBox, Heartbeat, Job, JobId, JobRequest, JobState, LayerInfo, Model, NewFeature, NewLayer, NewModel, Page, Plant,
     Progress, Survey, SurveyId,
 };
 pub use secret::Secret;
@@ -85,8 +85,13 @@ pub trait Store: AccessStore {
         only: Option<&[PlantId]>,
         page: Page,
     ) -> Result<Vec<Plant>, StoreError>;
-    /// Deletes a plant with every row that belongs to it; whether there was one. Its workers lose their jobs.
-    async fn delete_plant(&self, id: PlantId) -> Result<bool, StoreError>;
+    /// Deletes a plant with every row that belongs to it, and notes that its blobs are to go; whether there was one. Its
+    /// workers lose their jobs.
+    async fn delete_plant(&self, id: PlantId, now: Timestamp) -> Result<bool, StoreError>;
+    /// Plants that were deleted and whose blobs may still be there.
+    async fn deleted_plants(&self) -> Result<Vec<PlantId>, StoreError>;
+    /// Forgets the plants that were deleted before a time.
+    async fn forget_deleted_plants(&self, before: Timestamp) -> Result<(), StoreError>;
 
     /// Creates a survey of a plant, or finds the one of that name.
     async fn create_survey(&self, plant: PlantId, name: &str, now: Timestamp) -> Result<Created<Survey>, StoreError>;
@@ -109,9 +114,9 @@ pub trait Store: AccessStore {
     /// Cancels a queued job at once, asks a running one to stop, leaves a finished one.
     async fn cancel_job(&self, plant: PlantId, id: JobId, now: Timestamp) -> Result<Option<Cancelled>, StoreError>;
 
-    /// Takes the oldest job that may run: queued and due, or abandoned by its worker; of a plant none of whose jobs
-    /// runs. Ends jobs that were abandoned too often. The attempt is counted here, so that a job that kills its worker
-    /// does not run for ever.
+    /// Takes the job of the highest priority that may run, of these the oldest: queued and due, or abandoned by its
+    /// worker; of a plant none of whose jobs runs. Ends jobs that were abandoned too often. The attempt is counted here,
+    /// so that a job that kills its worker does not run for ever.
     async fn claim_job(&self, worker: &str, lease: Duration, now: Timestamp) -> Result<Option<Claim>, StoreError>;
     /// Extends the lease of a claimed job and records its progress.
     async fn heartbeat(
@@ -121,6 +126,13 @@ pub trait Store: AccessStore {
         lease: Duration,
         now: Timestamp,
     ) -> Result<Heartbeat, StoreError>;
+    /// Keeps what a claimed job has found so far, for input, options and program with this fingerprint; `false` where the
+    /// claim was lost. A job that got somewhere has all its attempts again.
+    async fn checkpoint(&self, claim: &Claim, fingerprint: &str, found: &[Checkpoint]) -> Result<bool, StoreError>;
+    /// What an unfinished job has found so far under this fingerprint.
+    async fn checkpoints(&self, job: JobId, fingerprint: &str) -> Result<Vec<Checkpoint>, StoreError>;
+    /// What each stage of the last job took, JSON, whoever's job that was.
+    async fn last_stage_ms(&self) -> Result<Option<String>, StoreError>;
     /// Ends a claimed job with its model: the job's end and the model appear together.
     async fn complete_job(&self, claim: &Claim, model: &NewModel, now: Timestamp) -> Result<Completed, StoreError>;
     /// Ends a claimed job without a model, or puts it back; `false` where the claim was lost.

@@ -135,6 +135,16 @@ pub struct Progress {
     pub stage: String,
     pub done: u64,
     pub total: u64,
+    /// Milliseconds until the job ends, where that can be told.
+    pub remaining_ms: Option<u64>,
+}
+
+/// Something that a job has found so far.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Checkpoint {
+    /// What it is of.
+    pub name: String,
+    pub document: Vec<u8>,
 }
 
 /// One mapping of a survey.
@@ -147,6 +157,8 @@ pub struct Job {
     pub state: JobState,
     /// The mapping's options, JSON.
     pub options: String,
+    /// The higher, the sooner.
+    pub priority: i32,
     pub progress: Option<Progress>,
     pub warnings: Vec<Warning>,
     /// Code and message of the last failure.
@@ -169,6 +181,9 @@ pub struct JobRequest {
     pub survey: SurveyId,
     /// The mapping's options, JSON.
     pub options: String,
+    /// The higher, the sooner.
+    pub priority: i32,
+    /// How often it is started without getting anywhere before it fails.
     pub max_attempts: u32,
 }
 
@@ -211,7 +226,7 @@ pub enum Heartbeat {
 pub enum Ending {
     /// For good.
     Failed { code: String, message: String },
-    /// To be tried again from `at`, unless that was the last attempt.
+    /// To be tried again from `at`, unless that was the last attempt of those that got nowhere.
     Retry { code: String, message: String, at: Timestamp },
     /// Because someone asked for it.
     Cancelled,
@@ -252,6 +267,8 @@ pub struct NewModel {
     pub sha256: Digest,
     pub size: u64,
     pub warnings: Vec<Warning>,
+    /// What each stage took, JSON, where the mapping ran in one go.
+    pub stage_ms: Option<String>,
     pub layers: Vec<NewLayer>,
 }
 

@@ -18,8 +18,8 @@ macro_rules! survey {
 }
 macro_rules! job {
     () => {
-        "seq, id, plant_id, survey_id, state, options, stage, done, total, warnings, error_code, error_message, attempt, \
-         max_attempts, fence, cancel_requested, model_version, created_ms, started_ms, finished_ms"
+        "seq, id, plant_id, survey_id, state, options, priority, stage, done, total, remaining_ms, warnings, error_code, \
+         error_message, attempt, max_attempts, fence, cancel_requested, model_version, created_ms, started_ms, finished_ms"
     };
 }
 macro_rules! model {
@@ -85,6 +85,10 @@ pub const PLANTS: &str = concat!(
      ORDER BY seq LIMIT $4"
 );
 pub const DELETE_PLANT: &str = "DELETE FROM plants WHERE id = $1";
+pub const NOTE_DELETED_PLANT: &str =
+    "INSERT INTO deleted_plants (plant_id, deleted_ms) VALUES ($1, $2) ON CONFLICT (plant_id) DO NOTHING";
+pub const DELETED_PLANTS: &str = "SELECT plant_id AS id FROM deleted_plants";
+pub const FORGET_DELETED_PLANTS: &str = "DELETE FROM deleted_plants WHERE deleted_ms < $1";
 
 pub const CREATE_SURVEY: &str = concat!(
     "INSERT INTO surveys (id, plant_id, name, created_ms) VALUES ($1, $2, $3, $4) \
@@ -106,8 +110,8 @@ pub const FILES: &str = "\
     SELECT path, size, sha256, width_px, height_px, stored_ms FROM files WHERE survey_id = $1 ORDER BY path";
 
 pub const ENQUEUE_JOB: &str = concat!(
-    "INSERT INTO jobs (id, plant_id, survey_id, state, options, max_attempts, run_after_ms, created_ms) \
-     VALUES ($1, $2, $3, 'queued', $4, $5, $6, $6) \
+    "INSERT INTO jobs (id, plant_id, survey_id, state, options, max_attempts, run_after_ms, created_ms, priority) \
+     VALUES ($1, $2, $3, 'queued', $4, $5, $6, $6, $7) \
      ON CONFLICT (survey_id) WHERE state IN ('queued', 'running') DO NOTHING RETURNING ",
     job!()
 );
@@ -135,28 +139,44 @@ pub const BURY_ABANDONED_JOBS: &str = "\
     error_code = CASE WHEN cancel_requested THEN error_code ELSE 'worker_lost' END, \
     error_message = CASE WHEN cancel_requested THEN error_message ELSE $2 END, \
     state = CASE WHEN cancel_requested THEN 'cancelled' ELSE 'failed' END \
-    WHERE state = 'running' AND lease_until_ms < $1 AND (cancel_requested OR attempt >= max_attempts)";
+    WHERE state = 'running' AND lease_until_ms < $1 AND (cancel_requested OR attempt - attempts_before >= max_attempts)";
 pub const CLAIM_JOB: &str = concat!(
     "UPDATE jobs SET state = 'running', worker = $1, attempt = attempt + 1, fence = fence + 1, lease_until_ms = $3, \
-     started_ms = COALESCE(started_ms, $2), stage = NULL, done = 0, total = 0 \
+     started_ms = COALESCE(started_ms, $2), stage = NULL, done = 0, total = 0, remaining_ms = NULL \
      WHERE seq = (SELECT candidate.seq FROM jobs AS candidate \
      WHERE ((candidate.state = 'queued' AND candidate.run_after_ms <= $2) \
      OR (candidate.state = 'running' AND candidate.lease_until_ms < $2)) \
      AND NOT EXISTS (SELECT 1 FROM jobs AS other WHERE other.plant_id = candidate.plant_id \
      AND other.seq <> candidate.seq AND other.state = 'running' AND other.lease_until_ms >= $2) \
-     ORDER BY candidate.seq LIMIT 1) RETURNING ",
+     ORDER BY candidate.priority DESC, candidate.seq LIMIT 1) RETURNING ",
     job!()
 );
 pub const HEARTBEAT: &str = "\
     UPDATE jobs SET lease_until_ms = $3, stage = COALESCE($4, stage), done = COALESCE($5, done), \
-    total = COALESCE($6, total) WHERE id = $1 AND fence = $2 AND state = 'running' RETURNING cancel_requested";
+    total = COALESCE($6, total), remaining_ms = CASE WHEN $4 IS NULL THEN remaining_ms ELSE $7 END \
+    WHERE id = $1 AND fence = $2 AND state = 'running' RETURNING cancel_requested";
+pub const MADE_PROGRESS: &str =
+    "UPDATE jobs SET attempts_before = attempt - 1 WHERE id = $1 AND fence = $2 AND state = 'running'";
+pub const CHECKPOINT: &str = "\
+    INSERT INTO checkpoints (job_id, name, fingerprint, document) VALUES ($1, $2, $3, $4) \
+    ON CONFLICT (job_id, name) DO UPDATE SET fingerprint = excluded.fingerprint, document = excluded.document";
+pub const CHECKPOINTS: &str = "SELECT name, document FROM checkpoints WHERE job_id = $1 AND fingerprint = $2";
+/// What ended jobs had found is in their models, or of no use.
+pub const SWEEP_CHECKPOINTS: &str = "\
+    DELETE FROM checkpoints WHERE NOT EXISTS (SELECT 1 FROM jobs WHERE jobs.id = checkpoints.job_id \
+    AND jobs.state IN ('queued', 'running'))";
+pub const ATTEMPTS_USED: &str =
+    "SELECT attempt - attempts_before FROM jobs WHERE id = $1 AND fence = $2 AND state = 'running'";
+pub const LAST_STAGE_MS: &str = "SELECT stage_ms FROM jobs WHERE stage_ms IS NOT NULL ORDER BY seq DESC LIMIT 1";
 pub const COMPLETE_JOB: &str = "\
     UPDATE jobs SET state = 'succeeded', finished_ms = $3, lease_until_ms = NULL, warnings = $4, model_version = $5, \
-    error_code = NULL, error_message = NULL WHERE id = $1 AND fence = $2 AND state = 'running'";
+    error_code = NULL, error_message = NULL, remaining_ms = NULL, stage_ms = $6 \
+    WHERE id = $1 AND fence = $2 AND state = 'running'";
 /// `$3` the state, `$4` code, `$5` message, `$6` the time from which to try again, `$7` the time of the end.
 pub const END_JOB: &str = "\
     UPDATE jobs SET state = $3, error_code = COALESCE($4, error_code), error_message = COALESCE($5, error_message), \
-    run_after_ms = COALESCE($6, run_after_ms), finished_ms = $7, lease_until_ms = NULL, attempt = attempt - $8 \
+    run_after_ms = COALESCE($6, run_after_ms), finished_ms = $7, lease_until_ms = NULL, remaining_ms = NULL, \
+    attempt = attempt - $8 \
     WHERE id = $1 AND fence = $2 AND state = 'running'";
 
 pub const INSERT_MODEL: &str = concat!(

@@ -1,11 +1,11 @@
 //! A service of its own for each test.
 
 use heliomap::config::Limits;
-use heliomap::detection::Detector;
+use heliomap::detection::{Detector, ImageDetections};
 use heliomap::geometry::{GeodeticReference, Lla};
 use heliomap::http::{AppState, router};
 use heliomap::jobs::{Mapper, PipelineMapper, Worker, WorkerSettings};
-use heliomap::pipeline::{MapError, MapOptions, Observer, Stage, Subject};
+use heliomap::pipeline::{Found, MapError, MapOptions, Observer, Stage, Subject};
 use heliomap::plant::{
     Bench, BenchId, Line, LineId, Module, ModuleId, ModuleStatus, PlantId, PlantModel, Sector, SectorId, Warning,
 };
@@ -31,6 +31,10 @@ pub enum Act {
     Panic,
     /// Waits to be cancelled.
     Wait,
+    /// Hears nothing for a second.
+    Deaf,
+    /// Finds something in one more image that it had not looked at, then fails.
+    FindOneAndFail,
 }
 
 /// Does as it is told, then as it was told last.
@@ -66,6 +70,22 @@ impl Mapper for ScriptedMapper {
             }
             Act::FailEnvironment => Err(MapError::Environment { message: "the detector cannot be loaded".to_owned() }),
             Act::Panic => panic!("as it was told"),
+            Act::Deaf => {
+                std::thread::sleep(Duration::from_secs(1));
+                Ok(model(subject, options, 1))
+            }
+            Act::FindOneAndFail => {
+                let next = (0..).find(|image| match observer.recall(&image.to_string()) {
+                    Some(found) => {
+                        assert_eq!(found.detections.image, image.to_string());
+                        false
+                    }
+                    None => true,
+                });
+                let found = nothing_in(&next.unwrap().to_string());
+                observer.found(&found);
+                Err(MapError::Environment { message: format!("image {} was found", found.detections.image) })
+            }
             Act::Wait => {
                 while !observer.cancelled() && !self.closing.is_cancelled() {
                     std::thread::sleep(Duration::from_millis(2));
@@ -74,6 +94,18 @@ impl Mapper for ScriptedMapper {
             }
         }
     }
+
+    fn identity(&self) -> Result<String, MapError> {
+        Ok("scripted".to_owned())
+    }
+}
+
+/// An image that shows no module.
+fn nothing_in(image: &str) -> Found {
+    let image = image.to_owned();
+    let detections = ImageDetections { image, width_px: 32, height_px: 24, detections: Vec::new() };
+    let layout = heliomap::layout::infer(&detections, None, &Default::default());
+    Found { detections, layout }
 }
 
 fn list(root: &Path, folder: &Path, files: &mut Vec<String>) {
@@ -228,7 +260,14 @@ impl App {
         }
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
         let base = format!("http://{}", listener.local_addr().unwrap());
-        let app = router(AppState { store: store.clone(), blobs, limits: Arc::new(limits), bell, insecure });
+        let app = router(AppState {
+            store: store.clone(),
+            blobs,
+            limits: Arc::new(limits),
+            bell,
+            stop: stop.clone(),
+            insecure,
+        });
         tokio::spawn(axum::serve(listener, app).with_graceful_shutdown(stop.clone().cancelled_owned()).into_future());
         Self { base, client: Client::new(), mapper, folder, store, secret: None, _stop: stop.drop_guard() }
     }

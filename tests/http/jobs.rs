@@ -123,3 +123,89 @@ async fn options_are_checked() {
     assert_eq!(empty.status(), StatusCode::ACCEPTED);
     assert!(empty.headers()["location"].to_str().unwrap().contains("/jobs/"));
 }
+
+#[tokio::test]
+async fn a_job_goes_on_where_it_was_and_getting_somewhere_gives_its_attempts_back() {
+    let app =
+        App::new(&[Act::FindOneAndFail, Act::FindOneAndFail, Act::FindOneAndFail, Act::FindOneAndFail, Act::Map(1)])
+            .await;
+    let survey = app.complete_survey().await;
+    let job = app.map(&survey).await;
+    assert_eq!((&job["state"], &job["attempt"], &job["max_attempts"]), (&json!("succeeded"), &json!(5), &json!(3)));
+
+    // Other files: what was found in the ones before counts for nothing.
+    let app = App::new(&[Act::FindOneAndFail, Act::Wait, Act::FindOneAndFail, Act::FailEnvironment]).await;
+    let survey = app.complete_survey().await;
+    let (_, job) = app.post(&format!("{survey}/jobs"), json!({})).await;
+    app.follow_until(&job, |job| job["state"] == "running" && job["attempt"] == 2).await;
+    app.put(&format!("{survey}/images/a.jpg"), crate::app::jpeg(64, 48)).await;
+    app.post(&format!("{}/cancel", job_path(&job)), json!(null)).await;
+    assert_eq!(app.follow(&job).await["state"], "cancelled");
+    let (_, job) = app.post(&format!("{survey}/jobs"), json!({})).await;
+    let job = app.follow_until(&job, |job| job["error"].is_object()).await;
+    assert_eq!(job["error"]["message"], "image 0 was found");
+}
+
+#[tokio::test]
+async fn a_job_whose_mapper_hears_nothing_is_cancelled_all_the_same() {
+    let app = App::new(&[Act::Deaf, Act::Map(2)]).await;
+    let survey = app.complete_survey().await;
+    let (_, job) = app.post(&format!("{survey}/jobs"), json!({})).await;
+    app.follow_until(&job, |job| job["state"] == "running").await;
+    app.post(&format!("{}/cancel", job_path(&job)), json!(null)).await;
+    assert_eq!(app.follow(&job).await["state"], "cancelled");
+    assert_eq!(app.mapper.seen.lock().unwrap().len(), 1);
+    let next = app.map(&survey).await;
+    assert_eq!((&next["state"], &next["model_version"]), (&json!("succeeded"), &json!(1)));
+}
+
+#[tokio::test]
+async fn the_highest_priority_goes_first() {
+    let app = App::new(&[]).await;
+    let survey = app.complete_survey().await;
+    let plant = plant_path(&survey).to_owned();
+    let (_, other) = app.post(&format!("{plant}/surveys"), json!({"name": "urgent"})).await;
+    let urgent = format!("{plant}/surveys/{}", other["id"].as_str().unwrap());
+    app.fill(&urgent).await;
+    app.post(&format!("{survey}/jobs"), json!({})).await;
+    let (_, job) = app.post(&format!("{urgent}/jobs"), json!({"priority": 7})).await;
+    assert_eq!(job["priority"], 7);
+    let now = jiff::Timestamp::now();
+    let claim = app.store.claim_job("test", Duration::from_secs(9), now).await.unwrap().unwrap();
+    assert_eq!(claim.job.id.to_string(), job["id"].as_str().unwrap());
+    assert_problem(
+        app.post(&format!("{survey}/jobs"), json!({"priority": 101})).await,
+        422,
+        "invalid_fields",
+        "priority",
+    );
+}
+
+#[tokio::test]
+async fn progress_comes_as_events() {
+    let app = App::new(&[Act::Wait]).await;
+    let survey = app.complete_survey().await;
+    let (_, job) = app.post(&format!("{survey}/jobs"), json!({})).await;
+    let path = format!("{}/events", job_path(&job));
+    let mut stream = app.request(reqwest::Method::GET, &path).send().await.unwrap();
+    assert_eq!(stream.headers()["content-type"], "text/event-stream");
+    app.follow_until(&job, |job| job["state"] == "running").await;
+    app.post(&format!("{}/cancel", job_path(&job)), json!(null)).await;
+    let mut text = String::new();
+    while let Some(chunk) = stream.chunk().await.unwrap() {
+        text.push_str(std::str::from_utf8(&chunk).unwrap());
+    }
+    let events: Vec<serde_json::Value> = text
+        .split("\n\n")
+        .filter_map(|event| serde_json::from_str(event.strip_prefix("event: job\ndata: ")?).ok())
+        .collect();
+    let (first, last) = (events.first().unwrap(), events.last().unwrap());
+    assert_eq!((&first["id"], &last["state"]), (&job["id"], &json!("cancelled")));
+    assert!(events.windows(2).all(|pair| pair[0] != pair[1]), "{events:?}");
+    assert_problem(
+        app.get(&path.replace(job["id"].as_str().unwrap(), "00000000-0000-4000-8000-000000000000")).await,
+        404,
+        "job_not_found",
+        "",
+    );
+}

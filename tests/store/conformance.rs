@@ -2,9 +2,9 @@
 
 use heliomap::plant::{Layer, ModuleId, PlantId, Warning};
 use heliomap::store::{
-    AuditEntry, Cancelled, Claim, Completed, Created, Digest, Ending, Enqueued, FeatureQuery, FileRecord, FileWritten,
-    GeoBox, Heartbeat, Job, JobRequest, JobState, KeyId, NewFeature, NewKey, NewLayer, NewModel, OrganisationId, Page,
-    Plant, Progress, Scope, SecretRecord, Store, StoreError, Survey, SurveyPath,
+    AuditEntry, Cancelled, Checkpoint, Claim, Completed, Created, Digest, Ending, Enqueued, FeatureQuery, FileRecord,
+    FileWritten, GeoBox, Heartbeat, Job, JobRequest, JobState, KeyId, NewFeature, NewKey, NewLayer, NewModel,
+    OrganisationId, Page, Plant, Progress, Scope, SecretRecord, Store, StoreError, Survey, SurveyPath,
 };
 use jiff::Timestamp;
 use std::time::Duration;
@@ -31,7 +31,8 @@ async fn survey(store: &dyn Store, plant: PlantId, name: &str) -> Survey {
 }
 
 async fn enqueue(store: &dyn Store, survey: &Survey) -> Job {
-    let request = JobRequest { plant: survey.plant, survey: survey.id, options: "{}".to_owned(), max_attempts: 2 };
+    let request =
+        JobRequest { plant: survey.plant, survey: survey.id, options: "{}".to_owned(), priority: 0, max_attempts: 2 };
     match store.enqueue_job(&request, at(0)).await.unwrap() {
         Enqueued::New(job) => job,
         Enqueued::Existing(job) => panic!("there is an unfinished job: {job:?}"),
@@ -72,7 +73,7 @@ fn model(plant: PlantId, version: u32, columns: u64) -> NewModel {
         NewLayer { layer: Layer::Lines, properties: "{}".to_owned(), features: Vec::new() },
     ];
     let warnings = vec![Warning::new("code", "message", ["a.jpg".to_owned()])];
-    NewModel { version, sha256: Digest::of(b"model"), size: 5, warnings, layers }
+    NewModel { version, sha256: Digest::of(b"model"), size: 5, warnings, stage_ms: Some("{}".to_owned()), layers }
 }
 
 pub async fn plants_and_surveys(store: &dyn Store) {
@@ -119,7 +120,8 @@ pub async fn files_all_or_none(store: &dyn Store) {
 pub async fn one_unfinished_job_per_survey(store: &dyn Store) {
     let survey = survey(store, plant(store, "A").await.id, "June").await;
     let job = enqueue(store, &survey).await;
-    let request = JobRequest { plant: survey.plant, survey: survey.id, options: "[]".to_owned(), max_attempts: 2 };
+    let request =
+        JobRequest { plant: survey.plant, survey: survey.id, options: "[]".to_owned(), priority: 0, max_attempts: 2 };
     let again = store.enqueue_job(&request, at(1)).await.unwrap();
     assert!(matches!(again, Enqueued::Existing(found) if found.id == job.id && found.options == "{}"));
     let claim = claim(store, 0).await.unwrap();
@@ -154,7 +156,7 @@ pub async fn an_abandoned_job_is_taken_up_and_its_first_worker_is_fenced_out(sto
     let survey = survey(store, plant(store, "A").await.id, "June").await;
     enqueue(store, &survey).await;
     let first = claim(store, 0).await.unwrap();
-    let progress = Progress { stage: "detect".to_owned(), done: 3, total: 9 };
+    let progress = Progress { stage: "detect".to_owned(), done: 3, total: 9, remaining_ms: Some(7) };
     assert_eq!(store.heartbeat(&first, Some(progress.clone()), LEASE, at(20)).await.unwrap(), Heartbeat::Continue);
     assert_eq!(store.job(survey.plant, first.job.id).await.unwrap().unwrap().progress, Some(progress));
     assert!(claim(store, 49).await.is_none());
@@ -293,8 +295,8 @@ pub async fn a_deleted_plant_takes_everything_with_it(store: &dyn Store) {
     let stored = store.model(survey.plant, None).await.unwrap().unwrap();
     enqueue(store, &survey).await;
     let running = claim(store, 2).await.unwrap();
-    assert!(store.delete_plant(survey.plant).await.unwrap());
-    assert!(!store.delete_plant(survey.plant).await.unwrap());
+    assert!(store.delete_plant(survey.plant, at(9)).await.unwrap());
+    assert!(!store.delete_plant(survey.plant, at(9)).await.unwrap());
     assert_eq!(store.heartbeat(&running, None, LEASE, at(3)).await.unwrap(), Heartbeat::Lost);
     assert!(store.files(survey.id).await.unwrap().is_empty());
     assert!(store.model(survey.plant, None).await.unwrap().is_none());
@@ -430,4 +432,69 @@ pub async fn audit_log(store: &dyn Store) {
     assert_eq!((&log[0].1.key, &log[1].1.key, log[0].1.at), (&Some(key), &None, at(3)));
     let rest = store.audit(a, Page { after: Some(log[0].0), limit: 9 }).await.unwrap();
     assert_eq!(rest.len(), 1);
+}
+
+pub async fn checkpoints_live_as_long_as_their_job(store: &dyn Store) {
+    let survey = survey(store, plant(store, "A").await.id, "June").await;
+    let job = enqueue(store, &survey).await;
+    let kept = |name: &str| Checkpoint { name: name.to_owned(), document: name.as_bytes().to_vec() };
+    let first = claim(store, 0).await.unwrap();
+    assert!(store.checkpoint(&first, "f", &[kept("a"), kept("b")]).await.unwrap());
+    assert_eq!(store.checkpoints(job.id, "f").await.unwrap(), [kept("a"), kept("b")]);
+    assert!(store.checkpoints(job.id, "g").await.unwrap().is_empty());
+    let second = claim(store, 31).await.unwrap();
+    assert!(!store.checkpoint(&first, "f", &[kept("c")]).await.unwrap());
+    // The second attempt gets somewhere: the next two may fail before the job does.
+    assert!(store.checkpoint(&second, "g", &[kept("a")]).await.unwrap());
+    assert_eq!(store.checkpoints(job.id, "f").await.unwrap(), [kept("b")]);
+    let third = claim(store, 62).await.unwrap();
+    assert_eq!(third.job.attempt, 3);
+    let retry = Ending::Retry { code: "environment".to_owned(), message: "m".to_owned(), at: at(63) };
+    assert!(store.end_job(&third, &retry, at(63)).await.unwrap());
+    assert_eq!(state(store, &job).await, JobState::Failed);
+    assert!(store.checkpoints(job.id, "g").await.unwrap().is_empty());
+
+    // Two attempts that got nowhere, counted from the last that did.
+    let job = enqueue(store, &survey).await;
+    let claimed = claim(store, 100).await.unwrap();
+    assert!(store.checkpoint(&claimed, "f", &[kept("a")]).await.unwrap());
+    assert!(claim(store, 200).await.is_some());
+    assert!(claim(store, 300).await.is_none());
+    assert_eq!(state(store, &job).await, JobState::Failed);
+    assert!(store.checkpoints(job.id, "f").await.unwrap().is_empty());
+}
+
+pub async fn jobs_by_priority(store: &dyn Store) {
+    let mut jobs = Vec::new();
+    for (name, priority) in [("A", 0), ("B", 5), ("C", 5), ("D", -5)] {
+        let survey = survey(store, plant(store, name).await.id, "June").await;
+        let options = "{}".to_owned();
+        let request = JobRequest { plant: survey.plant, survey: survey.id, options, priority, max_attempts: 2 };
+        let Enqueued::New(job) = store.enqueue_job(&request, at(0)).await.unwrap() else { panic!("it is new") };
+        assert_eq!(job.priority, priority);
+        jobs.push(job.id);
+    }
+    for expected in [1, 2, 0, 3] {
+        assert_eq!(claim(store, 0).await.unwrap().job.id, jobs[expected]);
+    }
+}
+
+pub async fn the_last_jobs_pace_is_known(store: &dyn Store) {
+    assert_eq!(store.last_stage_ms().await.unwrap(), None);
+    let survey = survey(store, plant(store, "A").await.id, "June").await;
+    enqueue(store, &survey).await;
+    let first = claim(store, 0).await.unwrap();
+    store.complete_job(&first, &model(survey.plant, 1, 1), at(1)).await.unwrap();
+    assert_eq!(store.last_stage_ms().await.unwrap().as_deref(), Some("{}"));
+}
+
+pub async fn deleted_plants_are_remembered(store: &dyn Store) {
+    let plant = plant(store, "A").await.id;
+    assert!(store.deleted_plants().await.unwrap().is_empty());
+    assert!(store.delete_plant(plant, at(5)).await.unwrap());
+    assert_eq!(store.deleted_plants().await.unwrap(), [plant]);
+    store.forget_deleted_plants(at(5)).await.unwrap();
+    assert_eq!(store.deleted_plants().await.unwrap(), [plant]);
+    store.forget_deleted_plants(at(6)).await.unwrap();
+    assert!(store.deleted_plants().await.unwrap().is_empty());
 }

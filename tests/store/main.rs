@@ -32,6 +32,10 @@ on_sqlite!(
     a_job_that_kills_its_workers_ends,
     a_released_job_has_its_attempt_back,
     retry_waits_and_ends,
+    checkpoints_live_as_long_as_their_job,
+    jobs_by_priority,
+    the_last_jobs_pace_is_known,
+    deleted_plants_are_remembered,
     cancel,
     models_and_features,
     two_models_of_one_version_are_not_written,
@@ -66,7 +70,7 @@ async fn what_was_there_before_is_kept() {
     let plants = store.plants(OrganisationId::DEFAULT, None, all).await.unwrap();
     assert_eq!((plants.len(), plants[0].id.to_string().as_str()), (1, plant));
     assert_eq!(store.surveys(plants[0].id, all).await.unwrap().len(), 1);
-    assert!(store.delete_plant(plants[0].id).await.unwrap());
+    assert!(store.delete_plant(plants[0].id, jiff::Timestamp::UNIX_EPOCH).await.unwrap());
     assert!(store.surveys(plants[0].id, all).await.unwrap().is_empty());
 }
 

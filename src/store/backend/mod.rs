@@ -6,11 +6,11 @@ mod read;
 
 use super::super::sql;
 use super::super::{
-    Cancelled, Claim, Completed, Created, Ending, Enqueued, Feature, FeatureQuery, FileRecord, FileWritten, GeoBox,
-    Heartbeat, Job, JobId, JobRequest, LayerInfo, Model, NewFeature, NewModel, OrganisationId, Page, Plant, Progress,
-    Store, StoreError, Survey, SurveyId,
+    Cancelled, Checkpoint, Claim, Completed, Created, Ending, Enqueued, Feature, FeatureQuery, FileRecord, FileWritten,
+    GeoBox, Heartbeat, Job, JobId, JobRequest, LayerInfo, Model, NewFeature, NewModel, OrganisationId, Page, Plant,
+    Progress, Store, StoreError, Survey, SurveyId,
 };
-use super::{Rows, Tx};
+use super::{Row, Rows, Tx};
 use crate::plant::{Layer, ModuleId, PlantId};
 use async_trait::async_trait;
 use jiff::Timestamp;
@@ -74,9 +74,25 @@ impl Store for Rows {
         query.fetch_all(&self.read).await?.iter().map(plant).collect()
     }
 
-    async fn delete_plant(&self, id: PlantId) -> Result<bool, StoreError> {
-        let done = sqlx::query(sql::DELETE_PLANT).bind(id.to_string()).execute(&self.write).await?;
+    async fn delete_plant(&self, id: PlantId, now: Timestamp) -> Result<bool, StoreError> {
+        let mut tx = self.begin().await?;
+        let done = sqlx::query(sql::DELETE_PLANT).bind(id.to_string()).execute(&mut *tx).await?;
+        if done.rows_affected() > 0 {
+            let query = sqlx::query(sql::NOTE_DELETED_PLANT).bind(id.to_string()).bind(now.as_millisecond());
+            query.execute(&mut *tx).await?;
+        }
+        tx.commit().await?;
         Ok(done.rows_affected() > 0)
+    }
+
+    async fn deleted_plants(&self) -> Result<Vec<PlantId>, StoreError> {
+        let rows = sqlx::query(sql::DELETED_PLANTS).fetch_all(&self.read).await?;
+        rows.iter().map(|row| Ok(PlantId(read::uuid(row, "id")?))).collect()
+    }
+
+    async fn forget_deleted_plants(&self, before: Timestamp) -> Result<(), StoreError> {
+        sqlx::query(sql::FORGET_DELETED_PLANTS).bind(before.as_millisecond()).execute(&self.write).await?;
+        Ok(())
     }
 
     async fn create_survey(&self, plant: PlantId, name: &str, now: Timestamp) -> Result<Created<Survey>, StoreError> {
@@ -160,6 +176,7 @@ impl Store for Rows {
             .bind(&request.options)
             .bind(i64::from(request.max_attempts))
             .bind(now.as_millisecond())
+            .bind(i64::from(request.priority))
             .fetch_optional(&mut *tx)
             .await
             .map_err(gone("survey"))?;
@@ -196,7 +213,10 @@ impl Store for Rows {
         let query = sqlx::query(sql::CANCEL_JOB).bind(plant.to_string()).bind(id.to_string());
         let row = query.bind(now.as_millisecond()).fetch_optional(&mut *tx).await?;
         let outcome = match row {
-            Some(row) => Some(Cancelled::Accepted(job(&row)?)),
+            Some(row) => {
+                sqlx::query(sql::SWEEP_CHECKPOINTS).execute(&mut *tx).await?;
+                Some(Cancelled::Accepted(job(&row)?))
+            }
             None => {
                 let query = sqlx::query(sql::JOB).bind(plant.to_string()).bind(id.to_string());
                 let row = query.fetch_optional(&mut *tx).await?;
@@ -209,11 +229,14 @@ impl Store for Rows {
 
     async fn claim_job(&self, worker: &str, lease: Duration, now: Timestamp) -> Result<Option<Claim>, StoreError> {
         let mut tx = self.begin().await?;
-        sqlx::query(sql::BURY_ABANDONED_JOBS)
+        let buried = sqlx::query(sql::BURY_ABANDONED_JOBS)
             .bind(now.as_millisecond())
             .bind("every worker that took this job fell silent; see the workers' logs, then start a new job")
             .execute(&mut *tx)
             .await?;
+        if buried.rows_affected() > 0 {
+            sqlx::query(sql::SWEEP_CHECKPOINTS).execute(&mut *tx).await?;
+        }
         let row = sqlx::query(sql::CLAIM_JOB)
             .bind(worker)
             .bind(now.as_millisecond())
@@ -240,6 +263,7 @@ impl Store for Rows {
             .bind(progress.as_ref().map(|progress| progress.stage.clone()))
             .bind(progress.as_ref().map(|progress| progress.done as i64))
             .bind(progress.as_ref().map(|progress| progress.total as i64))
+            .bind(progress.as_ref().and_then(|progress| Some(progress.remaining_ms? as i64)))
             .fetch_optional(&self.write)
             .await?;
         Ok(match cancel {
@@ -247,6 +271,36 @@ impl Store for Rows {
             Some(true) => Heartbeat::Cancel,
             Some(false) => Heartbeat::Continue,
         })
+    }
+
+    async fn checkpoint(&self, claim: &Claim, fingerprint: &str, found: &[Checkpoint]) -> Result<bool, StoreError> {
+        let mut tx = self.begin().await?;
+        let query = sqlx::query(sql::MADE_PROGRESS).bind(claim.job.id.to_string()).bind(claim.fence);
+        if query.execute(&mut *tx).await?.rows_affected() == 0 {
+            return Ok(false);
+        }
+        for checkpoint in found {
+            sqlx::query(sql::CHECKPOINT)
+                .bind(claim.job.id.to_string())
+                .bind(&checkpoint.name)
+                .bind(fingerprint)
+                .bind(&checkpoint.document)
+                .execute(&mut *tx)
+                .await?;
+        }
+        tx.commit().await?;
+        Ok(true)
+    }
+
+    async fn checkpoints(&self, job: JobId, fingerprint: &str) -> Result<Vec<Checkpoint>, StoreError> {
+        let query = sqlx::query(sql::CHECKPOINTS).bind(job.to_string()).bind(fingerprint);
+        let rows = query.fetch_all(&self.read).await?;
+        let read = |row: &Row| Ok(Checkpoint { name: row.try_get("name")?, document: row.try_get("document")? });
+        rows.iter().map(read).collect()
+    }
+
+    async fn last_stage_ms(&self) -> Result<Option<String>, StoreError> {
+        Ok(sqlx::query_scalar(sql::LAST_STAGE_MS).fetch_optional(&self.read).await?)
     }
 
     async fn complete_job(&self, claim: &Claim, new: &NewModel, now: Timestamp) -> Result<Completed, StoreError> {
@@ -258,6 +312,7 @@ impl Store for Rows {
             .bind(now.as_millisecond())
             .bind(&warnings)
             .bind(i64::from(new.version))
+            .bind(&new.stage_ms)
             .execute(&mut *tx)
             .await?;
         if done.rows_affected() == 0 {
@@ -297,13 +352,21 @@ impl Store for Rows {
                 insert_feature(&mut tx, stored.seq, layer.layer, index as i64 + 1, feature).await?;
             }
         }
+        sqlx::query(sql::SWEEP_CHECKPOINTS).execute(&mut *tx).await?;
         tx.commit().await?;
         Ok(Completed::Done(Box::new(stored)))
     }
 
     async fn end_job(&self, claim: &Claim, ending: &Ending, now: Timestamp) -> Result<bool, StoreError> {
         let now_ms = Some(now.as_millisecond());
-        let exhausted = claim.job.attempt >= claim.job.max_attempts;
+        let mut tx = self.begin().await?;
+        let used: Option<i64> = sqlx::query_scalar(sql::ATTEMPTS_USED)
+            .bind(claim.job.id.to_string())
+            .bind(claim.fence)
+            .fetch_optional(&mut *tx)
+            .await?;
+        let Some(used) = used else { return Ok(false) };
+        let exhausted = used >= i64::from(claim.job.max_attempts);
         let (state, code, message, run_after_ms, finished_ms, attempts_back) = match ending {
             Ending::Failed { code, message } => ("failed", Some(code), Some(message), None, now_ms, 0),
             Ending::Retry { code, message, .. } if exhausted => ("failed", Some(code), Some(message), None, now_ms, 0),
@@ -322,8 +385,10 @@ impl Store for Rows {
             .bind(run_after_ms)
             .bind(finished_ms)
             .bind(attempts_back)
-            .execute(&self.write)
+            .execute(&mut *tx)
             .await?;
+        sqlx::query(sql::SWEEP_CHECKPOINTS).execute(&mut *tx).await?;
+        tx.commit().await?;
         Ok(done.rows_affected() > 0)
     }
 

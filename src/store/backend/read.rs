@@ -95,6 +95,7 @@ pub fn job(row: &Row) -> Result<Job, StoreError> {
             stage,
             done: row.try_get::<i64, _>("done")? as u64,
             total: row.try_get::<i64, _>("total")? as u64,
+            remaining_ms: row.try_get::<Option<i64>, _>("remaining_ms")?.map(|ms| ms as u64),
         }),
         None => None,
     };
@@ -105,6 +106,7 @@ pub fn job(row: &Row) -> Result<Job, StoreError> {
         survey: SurveyId(uuid(row, "survey_id")?),
         state: parsed(row, "state")?,
         options: row.try_get("options")?,
+        priority: small("priority", row.try_get("priority")?)?,
         progress,
         warnings: warnings(row)?,
         error: error_code.zip(error_message),
@@ -152,7 +154,7 @@ fn parsed<T: FromStr>(row: &Row, column: &'static str) -> Result<T, StoreError> 
     value.parse().map_err(|_| StoreError::Corrupt { what: column, value })
 }
 
-fn uuid(row: &Row, column: &'static str) -> Result<Uuid, StoreError> {
+pub fn uuid(row: &Row, column: &'static str) -> Result<Uuid, StoreError> {
     parsed(row, column)
 }
 
