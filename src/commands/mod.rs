@@ -11,7 +11,7 @@ use anyhow::Context;
 use heliomap::config::{DetectorArgs, JobArgs, StorageArgs};
 use heliomap::detection::{DetectionError, Detector, Unet};
 use heliomap::jobs::{PipelineMapper, Worker, WorkerSettings};
-use heliomap::store::{Blobs, SqliteStore, Store};
+use heliomap::store::{Blobs, SqliteStore, Store, UploadStore};
 use jiff::Timestamp;
 use std::path::Path;
 use std::sync::Arc;
@@ -32,6 +32,8 @@ async fn open_storage(args: &StorageArgs) -> anyhow::Result<(Arc<dyn Store>, Blo
     let blobs = Blobs::in_folder(folder).with_context(hint)?;
     blobs.sweep_staging(STALE_UPLOADS).await.with_context(hint)?;
     let store = SqliteStore::open(&folder.join("heliomap.db")).await.with_context(hint)?;
+    store.delete_expired_uploads(Timestamp::now()).await?;
+    blobs.sweep_uploads(store.uploads().await?.into_iter().collect(), STALE_UPLOADS).await.with_context(hint)?;
     // A plant may have been deleted without its blobs, or while some were still coming.
     for plant in store.deleted_plants().await? {
         blobs.delete_plant(plant).await?;

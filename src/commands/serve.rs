@@ -35,6 +35,7 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
             blobs,
             limits: Arc::new(args.limits),
             bell,
+            desk: Arc::default(),
             stop: stop.clone(),
             insecure: args.insecure,
         });

@@ -46,6 +46,7 @@ codes! {
     JobNotFound = NOT_FOUND, "job_not_found", "There is no such job";
     ModelNotFound = NOT_FOUND, "model_not_found", "There is no such model";
     KeyNotFound = NOT_FOUND, "key_not_found", "There is no such key";
+    UploadNotFound = NOT_FOUND, "upload_not_found", "There is no such upload";
     ModuleNotFound = NOT_FOUND, "module_not_found", "There is no such module";
     MethodNotAllowed = METHOD_NOT_ALLOWED, "method_not_allowed", "The method does not apply here";
     Timeout = REQUEST_TIMEOUT, "timeout", "The request took too long";
@@ -53,11 +54,15 @@ codes! {
     SurveyIncomplete = CONFLICT, "survey_incomplete", "The survey cannot be mapped yet";
     JobFinished = CONFLICT, "job_finished", "The job has ended";
     JobStopping = CONFLICT, "job_stopping", "The survey's cancelled job has not stopped yet";
+    UploadOffset = CONFLICT, "upload_offset", "The bytes do not go on where the upload is";
+    TusVersion = PRECONDITION_FAILED, "tus_version", "The protocol's version is missing or another";
+    UploadBusy = LOCKED, "upload_busy", "The upload is in other hands";
     TooLarge = PAYLOAD_TOO_LARGE, "too_large", "The upload is too large";
     ArchiveTooLarge = PAYLOAD_TOO_LARGE, "archive_too_large", "The archive unpacks to too much";
     ImageTooLarge = PAYLOAD_TOO_LARGE, "image_too_large", "The image has too many pixels";
     UnsupportedMediaType = UNSUPPORTED_MEDIA_TYPE, "unsupported_media_type", "The body's media type does not apply here";
     UnsupportedArchive = UNSUPPORTED_MEDIA_TYPE, "unsupported_archive", "The body is no zip or tar";
+    ChecksumMismatch = UNPROCESSABLE_ENTITY, "checksum_mismatch", "The bytes came changed";
     InvalidName = UNPROCESSABLE_ENTITY, "invalid_name", "The name cannot be used";
     InvalidFields = UNPROCESSABLE_ENTITY, "invalid_fields", "The document has the wrong fields";
     UnknownFile = UNPROCESSABLE_ENTITY, "unknown_file", "The file is no part of a reconstruction";

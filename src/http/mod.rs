@@ -18,7 +18,9 @@ mod page;
 mod paging;
 mod plants;
 mod surveys;
+mod tus;
 mod uploads;
 
 pub use router::{openapi, router};
 pub use state::AppState;
+pub use tus::Desk;

@@ -2,7 +2,7 @@
 
 use super::guard::{Gate, Policy};
 use super::{
-    AppState, docs, error, events, features, guard, health, jobs, keys, models, page, plants, surveys, uploads,
+    AppState, docs, error, events, features, guard, health, jobs, keys, models, page, plants, surveys, tus, uploads,
 };
 use axum::Router;
 use axum::body::Body;
@@ -81,6 +81,8 @@ fn uploads() -> OpenApiRouter<AppState> {
         .routes(routes!(uploads::post_images))
         .routes(routes!(uploads::put_reconstruction, uploads::post_reconstruction))
         .routes(routes!(uploads::put_reconstruction_file))
+        .routes(routes!(tus::create, tus::options))
+        .routes(routes!(tus::head, tus::get, tus::patch, tus::terminate, tus::post))
 }
 
 /// The description of the whole API.

@@ -1,6 +1,7 @@
 //! What every handler may use.
 
 use super::error::{ApiError, Code};
+use super::tus::Desk;
 use crate::config::Limits;
 use crate::plant::PlantId;
 use crate::store::{Blobs, Plant, Store, Survey, SurveyId};
@@ -14,6 +15,7 @@ pub struct AppState {
     pub store: Arc<dyn Store>,
     pub blobs: Blobs,
     pub limits: Arc<Limits>,
+    pub desk: Arc<Desk>,
     /// Rung when a job was queued.
     pub bell: Arc<Notify>,
     /// Raised when the service stops: answers without an end end then.

@@ -45,7 +45,8 @@ pub struct UploadedArchive {
     pub ignored: Vec<String>,
 }
 
-fn uploaded((record, written): (FileRecord, FileWritten)) -> UploadedFile {
+/// A file that was stored, as it is told.
+pub fn uploaded((record, written): (FileRecord, FileWritten)) -> UploadedFile {
     let result = match written {
         FileWritten::Created => "created",
         FileWritten::Replaced => "replaced",
@@ -72,8 +73,8 @@ fn uploaded((record, written): (FileRecord, FileWritten)) -> UploadedFile {
         (status = 201, description = "Created", body = UploadedFile),
         (status = 200, description = "Replaced, or unchanged", body = UploadedFile),
         (status = "4XX", description = "`plant_not_found`, `survey_not_found`, `invalid_name`, `too_large`, `image_too_large`, \
-            `image_format_mismatch`, `image_unreadable`, `image_truncated`, `upload_interrupted`, `upload_stalled`",
-            body = Problem, content_type = "application/problem+json"),
+            `image_format_mismatch`, `image_unreadable`, `image_truncated`, `upload_interrupted`, `upload_stalled`, \
+            `bad_request`, `checksum_mismatch`", body = Problem, content_type = "application/problem+json"),
         (status = 507, description = "`storage_full`", body = Problem, content_type = "application/problem+json")
     )
 )]
@@ -108,7 +109,7 @@ pub async fn put_image(
         (status = 200, description = "Replaced, or unchanged", body = UploadedFile),
         (status = "4XX", description = "`plant_not_found`, `survey_not_found`, `unknown_file`, `invalid_name`, `too_large`, \
             `file_unreadable`, `image_too_large`, `image_format_mismatch`, `image_unreadable`, `image_truncated`, \
-            `upload_interrupted`, `upload_stalled`", body = Problem, content_type = "application/problem+json"),
+            `upload_interrupted`, `upload_stalled`, `bad_request`, `checksum_mismatch`", body = Problem, content_type = "application/problem+json"),
         (status = 507, description = "`storage_full`", body = Problem, content_type = "application/problem+json")
     )
 )]
@@ -169,7 +170,9 @@ async fn receive_body(
         return Err(intake::too_large(name, max_bytes));
     }
     let bounds = Bounds { name, max_bytes, idle: state.limits.request_timeout };
-    receive(body, state.blobs.staging(), bounds).await
+    let staged = receive(body, state.blobs.staging(), bounds).await?;
+    intake::digest::require(headers, &staged.sha256)?;
+    Ok(staged)
 }
 
 /// Upload many photos at once
@@ -293,7 +296,7 @@ struct PhotoForm {
         (status = "4XX", description = "`plant_not_found`, `survey_not_found`, `unsupported_archive`, `archive_unsafe`, \
             `archive_unreadable`, `archive_empty`, `archive_too_large`, `too_large`, `invalid_name`, `file_unreadable`, \
             `image_too_large`, `image_format_mismatch`, `image_unreadable`, `image_truncated`, `upload_interrupted`, \
-            `upload_stalled`", body = Problem, content_type = "application/problem+json"),
+            `upload_stalled`, `bad_request`, `checksum_mismatch`", body = Problem, content_type = "application/problem+json"),
         (status = 507, description = "`storage_full`", body = Problem, content_type = "application/problem+json")
     )
 )]
@@ -307,20 +310,7 @@ pub async fn put_reconstruction(
     let stored = async {
         state.require_survey(plant, survey).await?;
         let archive = receive_body(&state, "the archive", state.limits.max_archive_size, &headers, &mut body).await?;
-        let Unpacked { files, ignored, ignored_count } = unpack(&state, archive).await?;
-        let mut checked = Vec::with_capacity(files.len());
-        for (place, staged) in files {
-            let limit = match place.content() {
-                Content::Image => state.limits.max_image_size,
-                Content::Json { .. } | Content::Ply => state.limits.max_file_size,
-            };
-            if staged.size > limit {
-                return Err(intake::too_large(place.as_str(), limit));
-            }
-            checked.push(intake::check(&state, place, staged).await?);
-        }
-        let files = intake::store(&state, plant, survey, checked).await?.into_iter().map(uploaded).collect();
-        Ok(Json(UploadedArchive { files, ignored_count, ignored }))
+        store_archive(&state, plant, survey, archive).await.map(Json)
     };
     let stored: Result<_, ApiError> = stored.await;
     if let Err(problem) = &stored {
@@ -353,6 +343,29 @@ pub async fn post_reconstruction(
     body: Body,
 ) -> Result<Json<UploadedArchive>, ApiError> {
     put_reconstruction(state, path, headers, body).await
+}
+
+/// Stores the known files of an archive, all or none.
+pub async fn store_archive(
+    state: &AppState,
+    plant: PlantId,
+    survey: SurveyId,
+    archive: StagedFile,
+) -> Result<UploadedArchive, ApiError> {
+    let Unpacked { files, ignored, ignored_count } = unpack(state, archive).await?;
+    let mut checked = Vec::with_capacity(files.len());
+    for (place, staged) in files {
+        let limit = match place.content() {
+            Content::Image => state.limits.max_image_size,
+            Content::Json { .. } | Content::Ply => state.limits.max_file_size,
+        };
+        if staged.size > limit {
+            return Err(intake::too_large(place.as_str(), limit));
+        }
+        checked.push(intake::check(state, place, staged).await?);
+    }
+    let files = intake::store(state, plant, survey, checked).await?.into_iter().map(uploaded).collect();
+    Ok(UploadedArchive { files, ignored_count, ignored })
 }
 
 async fn unpack(state: &AppState, archive: StagedFile) -> Result<Unpacked, ApiError> {

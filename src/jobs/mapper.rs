@@ -4,9 +4,6 @@ use crate::detection::{DetectionError, Detector};
 use crate::pipeline::{self, Boxes, MapError, MapOptions, Observer, Subject};
 use crate::plant::PlantModel;
 use crate::store::Digest;
-use sha2::{Digest as _, Sha256};
-use std::fs::File;
-use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::sync::{Arc, Mutex, OnceLock};
 
@@ -78,21 +75,8 @@ impl Mapper for PipelineMapper {
 fn program() -> &'static str {
     static PROGRAM: OnceLock<String> = OnceLock::new();
     PROGRAM.get_or_init(|| {
-        let digest = || -> std::io::Result<Digest> {
-            let mut file = BufReader::with_capacity(1 << 20, File::open(std::env::current_exe()?)?);
-            let mut hasher = Sha256::new();
-            loop {
-                let bytes = file.fill_buf()?;
-                if bytes.is_empty() {
-                    break;
-                }
-                hasher.update(bytes);
-                let count = bytes.len();
-                file.consume(count);
-            }
-            Ok(Digest(hasher.finalize().into()))
-        };
-        digest().map_or_else(|_| uuid::Uuid::new_v4().to_string(), |digest| digest.to_string())
+        let digest = std::env::current_exe().and_then(|program| Digest::of_file(&program));
+        digest.map_or_else(|_| uuid::Uuid::new_v4().to_string(), |digest| digest.to_string())
     })
 }
 

@@ -1,15 +1,16 @@
 //! Bytes: content-addressed within a plant, so that what is stored once is never half-written, a plant's deletion
 //! deletes everything of it, and nobody learns from an upload what another plant holds.
 
-use super::StoreError;
+use super::{StoreError, UploadId};
 use crate::plant::PlantId;
 use futures::TryStreamExt;
 use object_store::local::LocalFileSystem;
 use object_store::path::Path as Key;
 use object_store::{ObjectStore, ObjectStoreExt};
 use sha2::Digest as _;
+use std::collections::HashSet;
 use std::fmt;
-use std::io::Write;
+use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::sync::Arc;
@@ -25,6 +26,21 @@ impl Digest {
     /// The digest of some bytes.
     pub fn of(bytes: &[u8]) -> Self {
         Self(sha2::Sha256::digest(bytes).into())
+    }
+
+    /// The digest of a file, which is read in parts.
+    pub fn of_file(path: &Path) -> std::io::Result<Self> {
+        let mut file = BufReader::with_capacity(1 << 20, std::fs::File::open(path)?);
+        let mut hasher = sha2::Sha256::new();
+        loop {
+            let bytes = file.fill_buf()?;
+            if bytes.is_empty() {
+                return Ok(Self(hasher.finalize().into()));
+            }
+            hasher.update(bytes);
+            let count = bytes.len();
+            file.consume(count);
+        }
     }
 }
 
@@ -67,23 +83,47 @@ pub struct Blobs {
     /// hard link, without copying either.
     local: Option<PathBuf>,
     staging: PathBuf,
+    uploads: PathBuf,
 }
 
 impl Blobs {
-    /// Blobs in the folder `blobs` of a data folder, uploads on their way in `incoming`.
+    /// Blobs in the folder `blobs` of a data folder, files on their way in `incoming`, uploads that may be resumed in
+    /// `uploads`.
     pub fn in_folder(data: &Path) -> Result<Self, StoreError> {
-        let (root, staging) = (data.join("blobs"), data.join("incoming"));
-        for folder in [&root, &staging] {
+        let (root, staging, uploads) = (data.join("blobs"), data.join("incoming"), data.join("uploads"));
+        for folder in [&root, &staging, &uploads] {
             std::fs::create_dir_all(folder).map_err(io("create the folder", folder))?;
         }
         let root = root.canonicalize().map_err(io("open the folder", &root))?;
         let store = LocalFileSystem::new_with_prefix(&root)?;
-        Ok(Self { store: Arc::new(store), local: Some(root), staging })
+        Ok(Self { store: Arc::new(store), local: Some(root), staging, uploads })
     }
 
     /// The local folder for files on their way in and for the folders of running jobs.
     pub fn staging(&self) -> &Path {
         &self.staging
+    }
+
+    /// Where the bytes of an upload that may be resumed lie until they are whole.
+    pub fn upload_file(&self, id: UploadId) -> PathBuf {
+        self.uploads.join(id.to_string())
+    }
+
+    /// Deletes the bytes of uploads that are not known, but for those so young that they may be just beginning.
+    pub async fn sweep_uploads(&self, known: HashSet<UploadId>, young: Duration) -> Result<(), StoreError> {
+        let known: HashSet<String> = known.iter().map(UploadId::to_string).collect();
+        let uploads = self.uploads.clone();
+        run_blocking("clean the folder", uploads.clone(), move || {
+            for entry in std::fs::read_dir(&uploads)? {
+                let entry = entry?;
+                let old = entry.metadata()?.modified()?.elapsed().is_ok_and(|age| age > young);
+                if old && !entry.file_name().to_str().is_some_and(|name| known.contains(name)) {
+                    std::fs::remove_file(entry.path())?;
+                }
+            }
+            Ok(())
+        })
+        .await
     }
 
     /// Deletes what crashes left among the files on their way in: whatever nobody touched for so long.

@@ -9,6 +9,7 @@ pub mod records;
 pub mod secret;
 pub mod sqlite;
 pub mod survey_path;
+pub mod uploads;
 
 mod sql;
 
@@ -22,6 +23,8 @@ pub use records::{
 pub use secret::Secret;
 pub use sqlite::SqliteStore;
 pub use survey_path::{Content, FileKind, ImageName, InvalidPath, SurveyPath};
+
+pub use uploads::{Upload, UploadId, UploadStore};
 
 use crate::plant::{Layer, ModuleId, PlantId};
 use jiff::Timestamp;
@@ -65,7 +68,7 @@ impl StoreError {
 
 /// The rows. Absence is `Ok(None)`; the time comes in from the caller.
 #[async_trait::async_trait]
-pub trait Store: AccessStore {
+pub trait Store: AccessStore + UploadStore {
     /// Fails where the database does not answer.
     async fn ping(&self) -> Result<(), StoreError>;
 

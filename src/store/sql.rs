@@ -109,6 +109,18 @@ pub const PUT_FILE: &str = "\
 pub const FILES: &str = "\
     SELECT path, size, sha256, width_px, height_px, stored_ms FROM files WHERE survey_id = $1 ORDER BY path";
 
+pub const CREATE_UPLOAD: &str = "\
+    INSERT INTO uploads (id, survey_id, length, received, partial, metadata, expires_ms) \
+    VALUES ($1, $2, $3, $4, $5, $6, $7)";
+pub const UPLOAD: &str = "\
+    SELECT id, survey_id, length, received, partial, metadata, expires_ms, outcome FROM uploads \
+    WHERE survey_id = $1 AND id = $2";
+pub const UPLOAD_RECEIVED: &str = "UPDATE uploads SET received = $2, expires_ms = $3 WHERE id = $1";
+pub const END_UPLOAD: &str = "UPDATE uploads SET outcome = $2 WHERE id = $1";
+pub const DELETE_UPLOAD: &str = "DELETE FROM uploads WHERE survey_id = $1 AND id = $2";
+pub const DELETE_EXPIRED_UPLOADS: &str = "DELETE FROM uploads WHERE expires_ms <= $1";
+pub const UPLOADS: &str = "SELECT id FROM uploads";
+
 pub const ENQUEUE_JOB: &str = concat!(
     "INSERT INTO jobs (id, plant_id, survey_id, state, options, max_attempts, run_after_ms, created_ms, priority) \
      VALUES ($1, $2, $3, 'queued', $4, $5, $6, $6, $7) \

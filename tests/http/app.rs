@@ -265,6 +265,7 @@ impl App {
             blobs,
             limits: Arc::new(limits),
             bell,
+            desk: Arc::default(),
             stop: stop.clone(),
             insecure,
         });

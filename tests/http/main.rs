@@ -12,3 +12,4 @@ mod models;
 mod plants;
 mod reconstruction;
 mod tenants;
+mod tus;

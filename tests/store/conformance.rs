@@ -4,7 +4,8 @@ use heliomap::plant::{Layer, ModuleId, PlantId, Warning};
 use heliomap::store::{
     AuditEntry, Cancelled, Checkpoint, Claim, Completed, Created, Digest, Ending, Enqueued, FeatureQuery, FileRecord,
     FileWritten, GeoBox, Heartbeat, Job, JobRequest, JobState, KeyId, NewFeature, NewKey, NewLayer, NewModel,
-    OrganisationId, Page, Plant, Progress, Scope, SecretRecord, Store, StoreError, Survey, SurveyPath,
+    OrganisationId, Page, Plant, Progress, Scope, SecretRecord, Store, StoreError, Survey, SurveyId, SurveyPath,
+    Upload, UploadId,
 };
 use jiff::Timestamp;
 use std::time::Duration;
@@ -497,4 +498,36 @@ pub async fn deleted_plants_are_remembered(store: &dyn Store) {
     assert_eq!(store.deleted_plants().await.unwrap(), [plant]);
     store.forget_deleted_plants(at(6)).await.unwrap();
     assert!(store.deleted_plants().await.unwrap().is_empty());
+}
+
+pub async fn uploads(store: &dyn Store) {
+    let survey = survey(store, plant(store, "A").await.id, "June").await;
+    let id = UploadId(Uuid::from_u128(7));
+    let mut upload = Upload {
+        id,
+        survey: survey.id,
+        length: 1 << 40,
+        received: 0,
+        partial: true,
+        metadata: "filename YS5qcGc=".to_owned(),
+        expires: at(100),
+        outcome: None,
+    };
+    store.create_upload(&upload).await.unwrap();
+    assert_eq!(store.upload(survey.id, id).await.unwrap(), Some(upload.clone()));
+    assert_eq!(store.upload(SurveyId(Uuid::nil()), id).await.unwrap(), None);
+    assert!(store.upload_received(id, 1 << 33, at(200)).await.unwrap());
+    assert!(!store.upload_received(UploadId(Uuid::nil()), 1, at(200)).await.unwrap());
+    store.end_upload(id, "{}").await.unwrap();
+    (upload.received, upload.expires, upload.outcome) = (1 << 33, at(200), Some("{}".to_owned()));
+    assert_eq!(store.upload(survey.id, id).await.unwrap(), Some(upload.clone()));
+    store.delete_expired_uploads(at(199)).await.unwrap();
+    assert_eq!(store.uploads().await.unwrap(), [id]);
+    store.delete_expired_uploads(at(200)).await.unwrap();
+    assert!(store.uploads().await.unwrap().is_empty());
+    store.create_upload(&upload).await.unwrap();
+    assert!(!store.delete_upload(SurveyId(Uuid::nil()), id).await.unwrap());
+    assert!(store.delete_upload(survey.id, id).await.unwrap());
+    upload.survey = SurveyId(Uuid::nil());
+    assert!(matches!(store.create_upload(&upload).await, Err(StoreError::Gone { what: "survey" })));
 }

@@ -26,6 +26,7 @@ on_sqlite!(
     audit_log,
     plants_and_surveys,
     files_all_or_none,
+    uploads,
     one_unfinished_job_per_survey,
     jobs_of_one_plant_run_one_after_the_other,
     an_abandoned_job_is_taken_up_and_its_first_worker_is_fenced_out,

@@ -2,6 +2,7 @@
 
 pub mod archive;
 pub mod content;
+pub mod digest;
 pub mod receive;
 
 use super::error::{ApiError, Code};
@@ -57,7 +58,7 @@ pub async fn store(
 }
 
 /// A failure of the service's own disk.
-fn disk(path: &Path, source: std::io::Error) -> ApiError {
+pub fn disk(path: &Path, source: std::io::Error) -> ApiError {
     crate::store::StoreError::Io { action: "use the file", path: path.to_owned(), source }.into()
 }
 

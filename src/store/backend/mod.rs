@@ -3,6 +3,7 @@
 
 mod access;
 mod read;
+mod uploads;
 
 use super::super::sql;
 use super::super::{

@@ -4,7 +4,7 @@ use super::super::Row;
 use crate::plant::{PlantId, Warning};
 use crate::store::{
     ApiKey, AuditEntry, FileRecord, Job, JobId, KeyId, Model, Organisation, OrganisationId, Plant, Progress,
-    StoreError, Survey, SurveyId, SurveyPath,
+    StoreError, Survey, SurveyId, SurveyPath, Upload, UploadId,
 };
 use jiff::Timestamp;
 use sqlx::Row as _;
@@ -83,6 +83,19 @@ pub fn file(row: &Row) -> Result<FileRecord, StoreError> {
         sha256: parsed(row, "sha256")?,
         size_px: width_px.zip(height_px).map(|(width, height)| [width, height]),
         stored: time(row, "stored_ms")?,
+    })
+}
+
+pub fn upload(row: &Row) -> Result<Upload, StoreError> {
+    Ok(Upload {
+        id: UploadId(uuid(row, "id")?),
+        survey: SurveyId(uuid(row, "survey_id")?),
+        length: row.try_get::<i64, _>("length")? as u64,
+        received: row.try_get::<i64, _>("received")? as u64,
+        partial: row.try_get("partial")?,
+        metadata: row.try_get("metadata")?,
+        expires: time(row, "expires_ms")?,
+        outcome: row.try_get("outcome")?,
     })
 }
 

@@ -1,0 +1,49 @@
+//! Uploads that may be resumed.
+
+use super::records::row_id;
+use super::{StoreError, SurveyId};
+use jiff::Timestamp;
+use std::fmt;
+use uuid::Uuid;
+
+row_id!(
+    /// Identifies an upload that may be resumed.
+    UploadId
+);
+
+/// An upload that may be resumed.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Upload {
+    pub id: UploadId,
+    pub survey: SurveyId,
+    /// Bytes of the whole file.
+    pub length: u64,
+    /// Bytes that are safe on disk.
+    pub received: u64,
+    /// Whether it is a part of a file that is put together later.
+    pub partial: bool,
+    /// What the client told of the file, as it told it.
+    pub metadata: String,
+    pub expires: Timestamp,
+    /// What became of the whole file, JSON.
+    pub outcome: Option<String>,
+}
+
+/// Uploads that may be resumed.
+#[async_trait::async_trait]
+pub trait UploadStore: Send + Sync + 'static {
+    /// Notes an upload to come.
+    async fn create_upload(&self, upload: &Upload) -> Result<(), StoreError>;
+    /// One upload to a survey, expired ones included.
+    async fn upload(&self, survey: SurveyId, id: UploadId) -> Result<Option<Upload>, StoreError>;
+    /// Notes how many bytes are safe, and a new end of its life; `false` where the upload is gone.
+    async fn upload_received(&self, id: UploadId, received: u64, expires: Timestamp) -> Result<bool, StoreError>;
+    /// Notes what became of the whole file, JSON.
+    async fn end_upload(&self, id: UploadId, outcome: &str) -> Result<(), StoreError>;
+    /// Forgets an upload; whether there was one.
+    async fn delete_upload(&self, survey: SurveyId, id: UploadId) -> Result<bool, StoreError>;
+    /// Forgets uploads whose time is over.
+    async fn delete_expired_uploads(&self, now: Timestamp) -> Result<(), StoreError>;
+    /// All uploads that are known.
+    async fn uploads(&self) -> Result<Vec<UploadId>, StoreError>;
+}

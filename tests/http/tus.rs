@@ -1,0 +1,205 @@
+//! Uploads that may be resumed.
+
+use crate::app::{App, assert_problem, jpeg, json_of};
+use base64::Engine;
+use base64::prelude::BASE64_STANDARD;
+use futures::StreamExt;
+use heliomap::store::Digest;
+use reqwest::{Method, RequestBuilder, Response, StatusCode};
+use serde_json::{Value, json};
+
+fn tus(app: &App, method: Method, path: &str) -> RequestBuilder {
+    app.request(method, path).header("tus-resumable", "1.0.0")
+}
+
+/// `Upload-Metadata` of one name.
+fn metadata(name: &str, value: &str) -> String {
+    format!("{name} {}", BASE64_STANDARD.encode(value))
+}
+
+async fn begin(app: &App, survey: &str, length: usize, metadata: &str) -> String {
+    let request = tus(app, Method::POST, &format!("{survey}/uploads")).header("upload-length", length);
+    let answer = request.header("upload-metadata", metadata).send().await.unwrap();
+    assert_eq!((answer.status(), &answer.headers()["tus-resumable"] == "1.0.0"), (StatusCode::CREATED, true));
+    assert!(answer.headers()["upload-expires"].to_str().unwrap().ends_with("GMT"));
+    answer.headers()["location"].to_str().unwrap().to_owned()
+}
+
+fn more(app: &App, upload: &str, offset: usize, bytes: &[u8]) -> RequestBuilder {
+    let request = tus(app, Method::PATCH, upload).header("upload-offset", offset);
+    request.header("content-type", "application/offset+octet-stream").body(bytes.to_vec())
+}
+
+async fn offset(app: &App, upload: &str) -> String {
+    let answer = tus(app, Method::HEAD, upload).send().await.unwrap();
+    assert_eq!(answer.status(), StatusCode::OK);
+    assert_eq!(answer.headers()["cache-control"], "no-store");
+    answer.headers()["upload-offset"].to_str().unwrap().to_owned()
+}
+
+async fn problem(answer: Response) -> (StatusCode, Value) {
+    json_of(answer).await
+}
+
+#[tokio::test]
+async fn a_photo_comes_in_pieces() {
+    let app = App::new(&[]).await;
+    let survey = app.survey().await;
+    let photo = jpeg(64, 48);
+    let upload = begin(&app, &survey, photo.len(), &metadata("filename", "a.jpg")).await;
+    let (first, rest) = photo.split_at(100);
+    let answer = more(&app, &upload, 0, first).send().await.unwrap();
+    assert_eq!(
+        (answer.status(), &answer.headers()["upload-offset"]),
+        (StatusCode::NO_CONTENT, &"100".parse().unwrap())
+    );
+    assert_eq!(offset(&app, &upload).await, "100");
+    let again = more(&app, &upload, 0, first).send().await.unwrap();
+    assert_problem(problem(again).await, 409, "upload_offset", "100 bytes are safe");
+    assert_eq!(more(&app, &upload, 100, rest).send().await.unwrap().status(), StatusCode::NO_CONTENT);
+    let (_, view) = app.get(&upload).await;
+    assert_eq!(view["outcome"]["files"][0]["path"], "images/a.jpg");
+    assert_eq!(view["outcome"]["files"][0]["sha256"], Digest::of(&photo).to_string());
+    assert_eq!(offset(&app, &upload).await, photo.len().to_string());
+    let (_, survey) = app.get(&survey).await;
+    assert_eq!(survey["files"][0]["width_px"], 64);
+    assert_eq!(std::fs::read_dir(app.folder.path().join("uploads")).unwrap().count(), 0);
+}
+
+#[tokio::test]
+async fn what_came_before_the_line_broke_counts() {
+    let app = App::new(&[]).await;
+    let survey = app.survey().await;
+    let photo = jpeg(64, 48);
+    let upload = begin(&app, &survey, photo.len(), &metadata("filename", "a.jpg")).await;
+    let pieces = [Ok(photo[..200].to_vec()), Err(std::io::Error::other("the line breaks"))];
+    let body = reqwest::Body::wrap_stream(futures::stream::iter(pieces).then(|piece| async {
+        tokio::time::sleep(std::time::Duration::from_millis(100)).await;
+        piece
+    }));
+    let broken = tus(&app, Method::PATCH, &upload).header("upload-offset", 0);
+    broken.header("content-type", "application/offset+octet-stream").body(body).send().await.unwrap_err();
+    // Asking how far it is takes the upload from the broken request.
+    let begun = std::time::Instant::now();
+    while offset(&app, &upload).await != "200" {
+        assert!(begun.elapsed().as_secs() < 20, "what came does not count");
+        tokio::time::sleep(std::time::Duration::from_millis(10)).await;
+    }
+    assert_eq!(more(&app, &upload, 200, &photo[200..]).send().await.unwrap().status(), StatusCode::NO_CONTENT);
+    assert_eq!(app.get(&survey).await.1["files"][0]["sha256"], Digest::of(&photo).to_string());
+}
+
+#[tokio::test]
+async fn checksums_are_checked() {
+    let app = App::new(&[]).await;
+    let survey = app.survey().await;
+    let photo = jpeg(64, 48);
+    let upload = begin(&app, &survey, photo.len(), &metadata("filename", "a.jpg")).await;
+    let sum = |bytes: &[u8]| format!("sha256 {}", BASE64_STANDARD.encode(Digest::of(bytes).0));
+    let changed = more(&app, &upload, 0, &photo[..50]).header("upload-checksum", sum(b"other")).send().await.unwrap();
+    assert_problem(problem(changed).await, 460, "checksum_mismatch", "send them again");
+    assert_eq!(offset(&app, &upload).await, "0");
+    let unknown = more(&app, &upload, 0, &photo[..50]).header("upload-checksum", "md5 AAAA").send().await.unwrap();
+    assert_problem(problem(unknown).await, 400, "bad_request", "sha1,sha256");
+    // `printf abc | sha1sum`
+    let part = begin(&app, &survey, 9, &metadata("filename", "b.jpg")).await;
+    let sha1 = "sha1 qZk+NkcGgWq6PiVxeFDCbJzQ2J0=";
+    let abc = more(&app, &part, 0, b"abc").header("upload-checksum", sha1).send().await.unwrap();
+    assert_eq!(abc.status(), StatusCode::NO_CONTENT);
+    let good = more(&app, &upload, 0, &photo).header("upload-checksum", sum(&photo)).send().await.unwrap();
+    assert_eq!(good.status(), StatusCode::NO_CONTENT);
+
+    let put =
+        |digest: String| app.request(Method::PUT, &format!("{survey}/images/c.jpg")).header("repr-digest", digest);
+    let told = |bytes: &[u8]| format!("sha-512=:AA==:, sha-256=:{}:", BASE64_STANDARD.encode(Digest::of(bytes).0));
+    let changed = put(told(b"other")).body(photo.clone()).send().await.unwrap();
+    assert_problem(problem(changed).await, 422, "checksum_mismatch", "repr-digest");
+    assert_eq!(put(told(&photo)).body(photo.clone()).send().await.unwrap().status(), StatusCode::CREATED);
+}
+
+#[tokio::test]
+async fn a_file_is_put_together_from_its_parts() {
+    let app = App::new(&[]).await;
+    let survey = app.survey().await;
+    let photo = jpeg(64, 48);
+    let mut parts = Vec::new();
+    for bytes in [&photo[..300], &photo[300..]] {
+        let request = tus(&app, Method::POST, &format!("{survey}/uploads")).header("upload-concat", "partial");
+        let answer = request.header("upload-length", bytes.len()).send().await.unwrap();
+        let part = answer.headers()["location"].to_str().unwrap().to_owned();
+        more(&app, &part, 0, bytes).send().await.unwrap();
+        parts.push(part);
+    }
+    let join = async |urls: String| {
+        let request = tus(&app, Method::POST, &format!("{survey}/uploads")).header("upload-concat", urls);
+        json_of(request.header("upload-metadata", metadata("filename", "a.jpg")).send().await.unwrap()).await
+    };
+    let lonely = begin(&app, &survey, 5, &metadata("filename", "b.jpg")).await;
+    assert_problem(join(format!("final;{lonely}")).await, 400, "bad_request", "no part that is whole");
+    assert_eq!(join(format!("final;{}", parts.join(" "))).await.0, StatusCode::CREATED);
+    assert_eq!(app.get(&survey).await.1["files"][0]["sha256"], Digest::of(&photo).to_string());
+    assert_problem(app.get(&parts[0]).await, 404, "upload_not_found", "begin a new one");
+}
+
+#[tokio::test]
+async fn an_archive_may_be_resumed_too() {
+    let app = App::new(&[]).await;
+    let survey = app.survey().await;
+    let mut archive = tar::Builder::new(Vec::new());
+    let document = b"[{\"shots\": {}}]";
+    let mut header = tar::Header::new_ustar();
+    header.set_size(document.len() as u64);
+    archive.append_data(&mut header, "reconstruction.json", &document[..]).unwrap();
+    let archive = archive.into_inner().unwrap();
+    let upload = begin(&app, &survey, archive.len(), &metadata("path", "reconstruction")).await;
+    assert_eq!(more(&app, &upload, 0, &archive).send().await.unwrap().status(), StatusCode::NO_CONTENT);
+    assert_eq!(app.get(&survey).await.1["files"][0]["path"], "reconstruction.json");
+}
+
+#[tokio::test]
+async fn a_file_that_is_refused_says_why() {
+    let app = App::new(&[]).await;
+    let survey = app.survey().await;
+    let upload = begin(&app, &survey, 7, &metadata("filename", "a.jpg")).await;
+    let refused = more(&app, &upload, 0, b"no jpeg").send().await.unwrap();
+    assert_problem(problem(refused).await, 422, "image_unreadable", "images/a.jpg");
+    assert_eq!(app.get(&upload).await.1["outcome"]["problem"]["code"], "image_unreadable");
+    assert_eq!(app.get(&survey).await.1["files"], json!([]));
+    let ended = json_of(tus(&app, Method::DELETE, &upload).send().await.unwrap()).await;
+    assert_eq!(ended.0, StatusCode::NO_CONTENT);
+    assert_problem(app.get(&upload).await, 404, "upload_not_found", "");
+}
+
+#[tokio::test]
+async fn wrong_requests_are_refused() {
+    let app = App::new(&[]).await;
+    let survey = app.survey().await;
+    let uploads = format!("{survey}/uploads");
+    let options = app.request(Method::OPTIONS, &uploads).send().await.unwrap();
+    assert_eq!(options.status(), StatusCode::NO_CONTENT);
+    assert_eq!(options.headers()["tus-extension"], "creation,expiration,checksum,termination,concatenation");
+    let old = app.request(Method::POST, &uploads).send().await.unwrap();
+    assert_eq!(old.headers()["tus-version"], "1.0.0");
+    assert_problem(problem(old).await, 412, "tus_version", "1.0.0");
+    let create = async |length: &str, metadata: &str| {
+        let request = tus(&app, Method::POST, &uploads).header("upload-length", length);
+        problem(request.header("upload-metadata", metadata).send().await.unwrap()).await
+    };
+    assert_problem(create("5", "").await, 400, "bad_request", "filename");
+    assert_problem(create("5", "filename ???").await, 400, "bad_request", "base64");
+    assert_problem(create("-5", &metadata("filename", "a.jpg")).await, 400, "bad_request", "upload-length");
+    assert_problem(create("5", &metadata("filename", "../a.jpg")).await, 422, "invalid_name", "../a.jpg");
+    assert_problem(create("5", &metadata("path", "etc/passwd")).await, 422, "unknown_file", "etc/passwd");
+    let huge = create("99999999999999", &metadata("filename", "a.jpg")).await;
+    assert_problem(huge, 413, "too_large", "limit");
+    let upload = begin(&app, &survey, 3, &metadata("filename", "a.jpg")).await;
+    let typeless = tus(&app, Method::PATCH, &upload).header("upload-offset", 0).body("abc").send().await.unwrap();
+    assert_problem(problem(typeless).await, 415, "unsupported_media_type", "offset+octet-stream");
+    let long = more(&app, &upload, 0, b"abcdef").send().await.unwrap();
+    assert_problem(problem(long).await, 400, "bad_request", "3 bytes");
+    // Clients that cannot send PATCH.
+    let begun = begin(&app, &survey, 9, &metadata("filename", "a.jpg")).await;
+    let post = tus(&app, Method::POST, &begun).header("x-http-method-override", "PATCH").header("upload-offset", 0);
+    let post = post.header("content-type", "application/offset+octet-stream").body("abc").send().await.unwrap();
+    assert_eq!(post.status(), StatusCode::NO_CONTENT);
+}
