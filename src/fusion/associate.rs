@@ -19,6 +19,8 @@ const END_COST: f64 = 4.0;
 const END_COLUMN_COST: f64 = 1.0;
 /// Cost of a place that is a module in one view and a hole in the other.
 const HOLE_COST: f64 = 1.0;
+/// Most that it costs two pieces to share no module at all.
+const APART_COST: f64 = 0.5;
 /// Margin between the best and the second best shift above which a pair is beyond doubt.
 const SURE: f64 = 5.0;
 /// Margin above which a pair counts at all.
@@ -36,6 +38,9 @@ struct Hypothesis {
     row: i32,
     /// Cost of everything but positions.
     structure_cost: f64,
+    /// Whether both show some of the same modules; otherwise they stand beside each other in one bench, and the shift
+    /// tells nothing that joins them.
+    shares: bool,
     /// Position of a cell in `b` less that of the same cell in `a`, metres east and north.
     disparity_m: Vector2<f64>,
 }
@@ -282,16 +287,19 @@ fn pair(a: usize, b: usize, pieces: &[LocatedPiece], options: &FusionOptions) ->
             if disparity_m.norm() > options.max_disparity_m {
                 continue;
             }
-            if let Some(structure_cost) = structure_cost(first, second, col, row, options) {
-                hypotheses.push(Hypothesis { col, row, structure_cost, disparity_m });
+            let (mut structure_cost, shares) = structure_cost(first, second, col, row, options);
+            if !shares {
+                // Beside each other they may as well be two benches: nothing is contradicted.
+                structure_cost = structure_cost.min(APART_COST);
             }
+            hypotheses.push(Hypothesis { col, row, structure_cost, shares, disparity_m });
         }
     }
-    (!hypotheses.is_empty()).then_some(Pair { a, b, at_m, hypotheses })
+    hypotheses.iter().any(|hypothesis| hypothesis.shares).then_some(Pair { a, b, at_m, hypotheses })
 }
 
-/// What the ends and holes of two pieces cost under a shift; `None` if they share no detected place.
-fn structure_cost(a: &LocatedPiece, b: &LocatedPiece, col: i32, row: i32, options: &FusionOptions) -> Option<f64> {
+/// What the ends and holes of two pieces cost under a shift, and whether they share a detected place.
+fn structure_cost(a: &LocatedPiece, b: &LocatedPiece, col: i32, row: i32, options: &FusionOptions) -> (f64, bool) {
     let mut cost = 0.0;
     let mut shared = 0;
     let mut holes = 0;
@@ -303,9 +311,6 @@ fn structure_cost(a: &LocatedPiece, b: &LocatedPiece, col: i32, row: i32, option
                 (false, false) => {}
             }
         }
-    }
-    if shared == 0 {
-        return None;
     }
     cost += (f64::from(holes) * HOLE_COST).min(3.0 * HOLE_COST + 0.1 * f64::from(holes));
     // `beyond` columns of one piece lie past the end of the other.
@@ -329,7 +334,7 @@ fn structure_cost(a: &LocatedPiece, b: &LocatedPiece, col: i32, row: i32, option
             cost += END_COST;
         }
     }
-    Some(cost)
+    (cost, shared > 0)
 }
 
 /// A place, and what is left of the disparity there, metres.
@@ -437,7 +442,7 @@ fn choose(pair: &Pair, pieces: &[LocatedPiece], field: &DisparityField) -> Optio
     // That the two are different benches after all costs as much as two contradicted ends.
     let apart = 2.0 * END_COST + 2.0;
     let rival = second.map_or(apart, |second| costs[second].min(apart));
-    (costs[best] < apart).then_some(Choice { best, margin: rival - costs[best] })
+    (pair.hypotheses[best].shares && costs[best] < apart).then_some(Choice { best, margin: rival - costs[best] })
 }
 
 /// The shift between two benches-to-be that all their undecided pairs together favour: (column, row) from piece `base.0`
