@@ -6,6 +6,8 @@
 //! views. What the evidence decides beyond doubt joins first and tells how the views are displaced against each other;
 //! that decides the rest.
 
+use super::cluster::{Best, Link, Partition, Shift, Table, partition};
+use super::disparity::{Disparity, DisparityField};
 use super::{Doubt, FusionOptions, LocatedPiece, View};
 use crate::layout::End;
 use nalgebra::Vector2;
@@ -25,9 +27,12 @@ const APART_COST: f64 = 0.5;
 const SURE: f64 = 5.0;
 /// Margin above which a pair counts at all.
 const LIKELY: f64 = 2.5;
-/// Standard deviation of the disagreement of two views before anything is known of them, metres.
-const PRIOR_SIGMA_M: f64 = 0.35;
-
+/// Cost of pieces that show the same ground being different benches after all: as much as two contradicted ends.
+const DIFFERENT_COST: f64 = 2.0 * END_COST + 2.0;
+/// Cost of a shift that positions do not allow.
+const FAR_COST: f64 = 12.0;
+/// Cost of two pieces of one image, with a gap between them that is no whole number of modules, in one bench.
+const GAP_COST: f64 = 6.0;
 /// Degrees of freedom of the positions' errors: few, for local errors of structure from motion have long tails.
 const TAIL: f64 = 4.0;
 
@@ -54,13 +59,6 @@ struct Pair {
     hypotheses: Vec<Hypothesis>,
 }
 
-/// A scored pair: the best shift, and by how much it beats the next.
-#[derive(Debug, Clone, Copy)]
-struct Choice {
-    best: usize,
-    margin: f64,
-}
-
 /// Where a piece stands in its bench.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Placement {
@@ -74,42 +72,67 @@ pub struct Placement {
 
 /// Something that the evidence does not decide.
 #[derive(Debug, Clone)]
-pub(super) struct Undecided {
-    code: &'static str,
-    a: usize,
-    b: usize,
-    choices: Vec<i32>,
-    margin: f64,
+pub(super) enum Undecided {
+    /// Two pieces that by themselves belong elsewhere against each other than all the others say; how many such pairs
+    /// the bench has.
+    Conflict { a: usize, b: usize, columns: i32, rows: i32, pairs: usize },
+    /// Two sets of pieces over each other, and the likeliest shifts between the two pieces.
+    Unsure { a: usize, b: usize, choices: Vec<Shift>, margin: f64 },
 }
 
 impl Undecided {
+    fn pairs(&self) -> usize {
+        match self {
+            Self::Conflict { pairs, .. } => *pairs,
+            Self::Unsure { .. } => 1,
+        }
+    }
+
+    fn count(&mut self, number: usize) {
+        if let Self::Conflict { pairs, .. } = self {
+            *pairs = number;
+        }
+    }
+
     /// The sentence for a person.
     pub(super) fn describe(&self, views: &[View<'_>], pieces: &[LocatedPiece]) -> Doubt {
         let name = |piece: usize| views[pieces[piece].view].shot.name.clone();
-        let at = pieces[self.a].middle();
-        let shifts = |name: fn(&i32) -> String| self.choices.iter().map(name).collect::<Vec<_>>().join(" or ");
-        let message = match self.code {
-            "bench_conflict" => format!(
-                "the bench at {:.1} m east, {:.1} m north is seen differently in {} and {}: by the structure their columns \
-                 differ by {}, by the other images they do not; check how many modules its rows have",
-                at.x,
-                at.y,
-                name(self.a),
-                name(self.b),
-                shifts(|shift| format!("{shift:+}"))
-            ),
-            _ => format!(
-                "the bench at {:.1} m east, {:.1} m north shows no end in both {} and {}: column 1 of what the first shows \
-                 may be column {} of the second (margin {:.1}); they are not joined, and what lies over the other is left out",
-                at.x,
-                at.y,
-                name(self.a),
-                name(self.b),
-                shifts(|shift| (1 + shift).to_string()),
-                self.margin
-            ),
+        let at = |piece: usize| {
+            let middle = pieces[piece].middle();
+            format!("{:.1} m east, {:.1} m north", middle.x, middle.y)
         };
-        Doubt { code: self.code, message, images: vec![name(self.a), name(self.b)] }
+        match self {
+            Self::Conflict { a, b, columns, rows, pairs } => Doubt {
+                code: "bench_conflict",
+                message: format!(
+                    "the bench at {} is seen differently in {} and {} (and in {} more pairs of images): by what the two \
+                     show, columns differ by {columns:+} and rows by {rows:+}, by all images together they do not; check \
+                     how many modules its rows have",
+                    at(*a),
+                    name(*a),
+                    name(*b),
+                    pairs - 1
+                ),
+                images: vec![name(*a), name(*b)],
+            },
+            Self::Unsure { a, b, choices, margin } => {
+                let choices: Vec<String> =
+                    choices.iter().map(|(col, row)| format!("column {} row {}", 1 + col, 1 + row)).collect();
+                Doubt {
+                    code: "bench_shift_unsure",
+                    message: format!(
+                        "the bench at {} shows no end that both {} and {} see: column 1, row 1 of what the first shows may \
+                         be {} of the second (margin {margin:.1}); they are not joined, and what lies over the other is \
+                         left out",
+                        at(*a),
+                        name(*a),
+                        name(*b),
+                        choices.join(" or ")
+                    ),
+                    images: vec![name(*a), name(*b)],
+                }
+            }
+        }
     }
 }
 
@@ -119,75 +142,183 @@ pub struct Clusters {
     pub placements: Vec<Placement>,
     /// Pieces of each bench.
     pub members: Vec<Vec<usize>>,
-    /// How sure the joints of each bench are, as the smallest margin among them (infinite with one member).
+    /// How sure each bench is: by how much its least sure piece stands better where it is than anywhere else (infinite
+    /// with one member).
     pub margins: Vec<f64>,
     pub(super) doubts: Vec<Undecided>,
 }
 
 /// Finds the benches.
 pub fn associate(pieces: &[LocatedPiece], options: &FusionOptions) -> Clusters {
-    let pairs = overlapping_pairs(pieces, options);
-    let view_count = pieces.iter().map(|piece| piece.view + 1).max().unwrap_or(0);
-    let mut field = DisparityField::unknown(view_count);
-    let mut choices: Vec<Option<Choice>> = Vec::new();
-    for round in 0..4 {
-        choices = pairs.par_iter().map(|pair| choose(pair, pieces, &field)).collect();
-        if round < 3 {
-            let needed = if round == 0 { SURE } else { LIKELY };
-            field = DisparityField::fit(view_count, pieces, &pairs, &choices, needed);
-        }
+    let near = near_pairs(pieces, options);
+    let pairs: Vec<Pair> = near.par_iter().filter_map(|&(a, b)| pair(a, b, pieces, options)).collect();
+    let apart: Vec<Link> = near.par_iter().filter_map(|&(a, b)| gap_between(a, b, pieces)).collect();
+    let views = pieces.iter().map(|piece| piece.view + 1).max().unwrap_or(0);
+    let mut field = DisparityField::unknown(views);
+    for needed in [SURE, LIKELY, LIKELY] {
+        let known = disparities(&pairs, pieces, |k| {
+            let best = table(k, &pairs[k], pieces, &field).best()?;
+            (best.margin >= needed).then_some(best.shift)
+        });
+        field = DisparityField::fit(views, &known);
     }
-    let mut forest = Forest::new(pieces);
-    let mut order: Vec<usize> = (0..pairs.len()).filter(|k| choices[*k].is_some()).collect();
-    let margin_of = |k: usize| choices[k].map_or(0.0, |choice| choice.margin);
-    order.sort_by(|&i, &j| margin_of(j).total_cmp(&margin_of(i)).then(i.cmp(&j)));
-    let mut doubts = Vec::new();
-    for &k in &order {
-        let Some(choice) = choices[k].filter(|choice| choice.margin >= LIKELY) else { continue };
-        let (pair, best) = (&pairs[k], pairs[k].hypotheses[choice.best]);
-        match forest.join(pieces, pair.a, pair.b, best.col, best.row, choice.margin) {
-            Joined::Conflict(shift) if choice.margin >= SURE => doubts.push(Undecided {
-                code: "bench_conflict",
-                a: pair.a,
-                b: pair.b,
-                choices: vec![shift],
-                margin: choice.margin,
-            }),
-            _ => {}
-        }
+    let mut outcome = None;
+    for _ in 0..2 {
+        let mut links: Vec<Link> = pairs
+            .par_iter()
+            .enumerate()
+            .map(|(k, pair)| Link { a: pair.a, b: pair.b, table: table(k, pair, pieces, &field) })
+            .collect();
+        links.extend(apart.iter().cloned());
+        let joined = partition(pieces, &links, LIKELY);
+        // All joints together know more of the displacements than single pairs did.
+        let known = disparities(&pairs, pieces, |k| joined.between(pairs[k].a, pairs[k].b));
+        field = DisparityField::fit(views, &known);
+        outcome = Some((joined, links));
     }
-    // What is left lies over each other without a sure shift. All its pairs together may still decide; where they do not,
-    // a guess would invent modules: the pieces stay apart, the doubt is told, and the lesser one goes as a ghost.
-    let mut left: BTreeMap<(usize, usize), Vec<usize>> = BTreeMap::new();
-    for &k in &order {
-        let (a, b) = (forest.root(pairs[k].a), forest.root(pairs[k].b));
-        if a != b {
-            left.entry((a.min(b), a.max(b))).or_default().push(k);
-        }
+    match outcome {
+        Some((joined, links)) => clusters(&joined, &links),
+        None => Clusters { placements: Vec::new(), members: Vec::new(), margins: Vec::new(), doubts: Vec::new() },
     }
-    for undecided in left.values() {
-        let (a, b) = (pairs[undecided[0]].a, pairs[undecided[0]].b);
-        if forest.root(a) == forest.root(b) {
-            continue;
-        }
-        let Some((best, second, margin, margin_per_view)) =
-            pooled_choice(undecided, &pairs, pieces, &field, &mut forest, (a, b))
-        else {
-            continue;
-        };
-        if margin >= LIKELY {
-            forest.join(pieces, a, b, best.0, best.1, margin_per_view);
-        } else {
-            let mut shown = vec![best.0];
-            shown.extend(second.map(|second| second.0).filter(|second| *second != best.0));
-            doubts.push(Undecided { code: "bench_shift_unsure", a, b, choices: shown, margin });
-        }
-    }
-    forest.clusters(doubts)
 }
 
-/// All pairs of pieces of different views whose footprints come near each other.
-fn overlapping_pairs(pieces: &[LocatedPiece], options: &FusionOptions) -> Vec<Pair> {
+/// What the pairs with a known shift, under which they share modules, say of the displacements of their views.
+fn disparities(
+    pairs: &[Pair],
+    pieces: &[LocatedPiece],
+    shift: impl Fn(usize) -> Option<Shift> + Sync,
+) -> Vec<Disparity> {
+    pairs
+        .par_iter()
+        .enumerate()
+        .filter_map(|(k, pair)| {
+            let shift = shift(k)?;
+            let hypothesis = pair.hypotheses.iter().find(|h| (h.col, h.row) == shift && h.shares)?;
+            let views = (pieces[pair.a].view, pieces[pair.b].view);
+            Some(Disparity { pair: k, views, at_m: pair.at_m, value_m: hypothesis.disparity_m })
+        })
+        .collect()
+}
+
+/// What a pair says of every shift.
+fn table(index: usize, pair: &Pair, pieces: &[LocatedPiece], field: &DisparityField) -> Table {
+    let (a, b) = (&pieces[pair.a], &pieces[pair.b]);
+    let (expected, field_sigma) = field.expected(index, (a.view, b.view), pair.at_m);
+    let sigma = (field_sigma.powi(2) + a.sigma_m.powi(2) + b.sigma_m.powi(2)).sqrt();
+    let cost = |hypothesis: &Hypothesis| {
+        let off = (hypothesis.disparity_m - expected).norm() / sigma;
+        // Student's t in the plane: positions may be wrong by far more than they admit.
+        hypothesis.structure_cost + (TAIL + 2.0) / 2.0 * (1.0 + off * off / TAIL).ln()
+    };
+    // Two that show no module in common need not be of one bench, wherever they stand.
+    let apart = pair.hypotheses.iter().filter(|h| !h.shares).map(&cost).fold(DIFFERENT_COST, f64::min);
+    Table::new(pair.hypotheses.iter().map(|h| ((h.col, h.row), cost(h))), FAR_COST, apart)
+}
+
+/// Two pieces of one image, one behind the other, that no one lattice fits: a gap lies between them, and they are two
+/// benches.
+fn gap_between(a: usize, b: usize, pieces: &[LocatedPiece]) -> Option<Link> {
+    /// Farther off a lattice is too little known to tell, columns.
+    const NEAR: f64 = 3.0;
+    let (first, second) = (&pieces[a], &pieces[b]);
+    if first.view != second.view {
+        return None;
+    }
+    let (base, part) = if first.cells.len() >= second.cells.len() { (first, second) } else { (second, first) };
+    let outside = |at: &Vector2<f64>| (-at.x).max(at.x - f64::from(base.cols - 1));
+    let facing = part
+        .cells
+        .iter()
+        .filter(|cell| cell.detection.is_some())
+        .filter_map(|cell| base.ground.coordinate(cell.position_m.xy()))
+        .filter(|at| (-0.4..f64::from(base.rows) - 0.6).contains(&at.y))
+        .min_by(|p, q| outside(p).total_cmp(&outside(q)))?;
+    let beyond = outside(&facing);
+    if !(0.5..NEAR).contains(&beyond) || (facing.x - facing.x.round()).abs() < 0.15 + 0.03 * beyond {
+        return None;
+    }
+    Some(Link { a, b, table: Table::new([], GAP_COST, 0.0) })
+}
+
+/// The benches of a partition, numbered by their first piece, with what it leaves open.
+fn clusters(joined: &Partition, links: &[Link]) -> Clusters {
+    let mut number: BTreeMap<usize, usize> = BTreeMap::new();
+    let mut members: Vec<Vec<usize>> = Vec::new();
+    let mut margins: Vec<f64> = Vec::new();
+    let mut placements = Vec::with_capacity(joined.set.len());
+    for (piece, set) in joined.set.iter().enumerate() {
+        let cluster = *number.entry(*set).or_insert_with(|| {
+            members.push(Vec::new());
+            margins.push(f64::INFINITY);
+            members.len() - 1
+        });
+        members[cluster].push(piece);
+        margins[cluster] = margins[cluster].min(joined.margin[piece]);
+        let (col, row) = joined.shift[piece];
+        placements.push(Placement { cluster, col, row });
+    }
+    for group in &members {
+        let low_col = group.iter().map(|p| placements[*p].col).min().unwrap_or(0);
+        let low_row = group.iter().map(|p| placements[*p].row).min().unwrap_or(0);
+        for piece in group {
+            placements[*piece].col -= low_col;
+            placements[*piece].row -= low_row;
+        }
+    }
+    let doubts = undecided(joined, links, &number);
+    Clusters { placements, members, margins, doubts }
+}
+
+/// What is left open: in each bench the clearest pair that contradicts it, and sets of pieces that lie over each other
+/// without a sure shift.
+fn undecided(joined: &Partition, links: &[Link], number: &BTreeMap<usize, usize>) -> Vec<Undecided> {
+    let mut conflicts: BTreeMap<usize, (f64, Undecided)> = BTreeMap::new();
+    let mut open: BTreeMap<(usize, usize), (usize, usize, Table)> = BTreeMap::new();
+    for link in links {
+        let (a, b) = (number[&joined.set[link.a]], number[&joined.set[link.b]]);
+        if a == b {
+            let (Some(best), Some(placed)) = (link.table.best(), joined.between(link.a, link.b)) else { continue };
+            if best.margin < SURE || best.shift == placed {
+                continue;
+            }
+            let pairs = conflicts.get(&a).map_or(0, |(_, doubt)| doubt.pairs()) + 1;
+            let (columns, rows) = (best.shift.0 - placed.0, best.shift.1 - placed.1);
+            let new = (best.margin, Undecided::Conflict { a: link.a, b: link.b, columns, rows, pairs });
+            match conflicts.get_mut(&a) {
+                Some(known) if known.0 >= new.0 => known.1.count(pairs),
+                _ => {
+                    conflicts.insert(a, new);
+                }
+            }
+        } else {
+            // All that is known between two sets, as shifts between the two pieces that come first.
+            let (from, to, forwards) = if a < b { (link.a, link.b, true) } else { (link.b, link.a, false) };
+            let (first, second, table) =
+                open.entry((a.min(b), a.max(b))).or_insert_with(|| (from, to, Table::default()));
+            let moved =
+                |p: usize, q: usize| (joined.shift[p].0 - joined.shift[q].0, joined.shift[p].1 - joined.shift[q].1);
+            // first -> from -> to -> second
+            let (start, end) = (moved(*first, from), moved(to, *second));
+            table.add(&link.table, |s| {
+                let s = if forwards { s } else { (-s.0, -s.1) };
+                (start.0 + s.0 + end.0, start.1 + s.1 + end.1)
+            });
+        }
+    }
+    let mut doubts: Vec<Undecided> = conflicts.into_values().map(|(_, doubt)| doubt).collect();
+    for (a, b, table) in open.into_values() {
+        let Some(Best { shift, cost, second, margin }) = table.best() else { continue };
+        // What joins them costs less than what keeps them apart, and yet no shift is sure.
+        if cost + 1.0 < table.apart() && margin < LIKELY {
+            let choices = [Some(shift), second].into_iter().flatten().collect();
+            doubts.push(Undecided::Unsure { a, b, choices, margin });
+        }
+    }
+    doubts
+}
+
+/// All pairs of pieces whose footprints come near each other.
+fn near_pairs(pieces: &[LocatedPiece], options: &FusionOptions) -> Vec<(usize, usize)> {
     let boxes: Vec<GeomWithData<rstar::primitives::Rectangle<[f64; 2]>, usize>> = pieces
         .iter()
         .enumerate()
@@ -216,17 +347,17 @@ fn overlapping_pairs(pieces: &[LocatedPiece], options: &FusionOptions) -> Vec<Pa
         let (a, corners) = (item.data, item.geom());
         let envelope = AABB::from_corners(corners.lower(), corners.upper());
         for other in tree.locate_in_envelope_intersecting(envelope) {
-            if other.data > a && pieces[other.data].view != pieces[a].view {
+            if other.data > a {
                 near.push((a, other.data));
             }
         }
     }
     near.sort_unstable();
-    near.par_iter().filter_map(|&(a, b)| pair(a, b, pieces, options)).collect()
+    near
 }
 
 /// Where one cell of a piece stands in the lattice of another.
-struct Shift {
+struct CellShift {
     /// Columns and rows by which it stands outside the other piece.
     outside: f64,
     /// Its column and row there less its own.
@@ -235,9 +366,12 @@ struct Shift {
     at_m: Vector2<f64>,
 }
 
-/// The shifts that are possible between two pieces, or `None` if there is none.
+/// The shifts that are possible between two pieces of different views, or `None` if there is none.
 fn pair(a: usize, b: usize, pieces: &[LocatedPiece], options: &FusionOptions) -> Option<Pair> {
     let (first, second) = (&pieces[a], &pieces[b]);
+    if first.view == second.view {
+        return None;
+    }
     let [u, v] = first.pitch_m();
     let [other_u, other_v] = second.pitch_m();
     let alike = |p: Vector2<f64>, q: Vector2<f64>| {
@@ -250,13 +384,13 @@ fn pair(a: usize, b: usize, pieces: &[LocatedPiece], options: &FusionOptions) ->
         return None;
     }
     // Where the lattice of `a` lies in that of `b`, at the cells of `a` nearest to the middle of what they share.
-    let mut shifts: Vec<Shift> = Vec::new();
+    let mut shifts: Vec<CellShift> = Vec::new();
     let stride = (first.cells.len() / 24).max(1);
     for cell in first.cells.iter().step_by(stride) {
         let Some(at) = second.ground.coordinate(cell.position_m.xy()) else { continue };
         let outside_col = (-at.x).max(at.x - f64::from(second.cols - 1)).max(0.0);
         let outside_row = (-at.y).max(at.y - f64::from(second.rows - 1)).max(0.0);
-        shifts.push(Shift {
+        shifts.push(CellShift {
             outside: outside_col + outside_row,
             col: at.x - f64::from(cell.col),
             row: at.y - f64::from(cell.row),
@@ -270,7 +404,7 @@ fn pair(a: usize, b: usize, pieces: &[LocatedPiece], options: &FusionOptions) ->
         return None;
     }
     shifts.retain(|shift| shift.outside <= nearest + 0.5);
-    let median = |f: fn(&Shift) -> f64| {
+    let median = |f: fn(&CellShift) -> f64| {
         let mut values: Vec<f64> = shifts.iter().map(f).collect();
         values.sort_by(f64::total_cmp);
         values[values.len() / 2]
@@ -335,284 +469,4 @@ fn structure_cost(a: &LocatedPiece, b: &LocatedPiece, col: i32, row: i32, option
         }
     }
     (cost, shared > 0)
-}
-
-/// A place, and what is left of the disparity there, metres.
-type Residual = (Vector2<f64>, Vector2<f64>);
-
-/// How the positions of two views disagree: one displacement for each view, and nearby pairs of the same two views.
-struct DisparityField {
-    offset_m: Vec<Vector2<f64>>,
-    sigma_m: f64,
-    /// Residual disparities of sure pairs for each pair of views.
-    local: BTreeMap<(usize, usize), Vec<Residual>>,
-}
-
-impl DisparityField {
-    fn unknown(views: usize) -> Self {
-        Self { offset_m: vec![Vector2::zeros(); views], sigma_m: PRIOR_SIGMA_M, local: BTreeMap::new() }
-    }
-
-    /// Fits the displacement of each view to the pairs that are sure enough (Gauss-Seidel on the normal equations, with
-    /// a weak pull to nought), robustly.
-    fn fit(views: usize, pieces: &[LocatedPiece], pairs: &[Pair], choices: &[Option<Choice>], needed: f64) -> Self {
-        let sure: Vec<(usize, usize, Vector2<f64>, Vector2<f64>)> = pairs
-            .iter()
-            .zip(choices)
-            .filter_map(|(pair, choice)| {
-                let choice = choice.filter(|choice| choice.margin >= needed)?;
-                let disparity = pair.hypotheses[choice.best].disparity_m;
-                Some((pieces[pair.a].view, pieces[pair.b].view, pair.at_m, disparity))
-            })
-            .collect();
-        let mut field = Self::unknown(views);
-        if sure.is_empty() {
-            return field;
-        }
-        let mut of_view: Vec<Vec<usize>> = vec![Vec::new(); views];
-        for (k, (a, b, _, _)) in sure.iter().enumerate() {
-            of_view[*a].push(k);
-            of_view[*b].push(k);
-        }
-        let mut spread = PRIOR_SIGMA_M;
-        for _ in 0..30 {
-            for (view, sure_of_view) in of_view.iter().enumerate() {
-                let (mut sum, mut weight) = (Vector2::zeros(), 0.5);
-                for &k in sure_of_view {
-                    let (a, b, _, disparity) = sure[k];
-                    let target = if b == view { field.offset_m[a] + disparity } else { field.offset_m[b] - disparity };
-                    let robust = 1.0 / (1.0 + ((target - field.offset_m[view]).norm() / spread).powi(2));
-                    sum += target * robust;
-                    weight += robust;
-                }
-                field.offset_m[view] = sum / weight;
-            }
-        }
-        let mut residuals: Vec<f64> = Vec::with_capacity(sure.len());
-        for (a, b, at, disparity) in &sure {
-            let rest = disparity - (field.offset_m[*b] - field.offset_m[*a]);
-            residuals.push(rest.norm());
-            field.local.entry((*a, *b)).or_default().push((*at, rest));
-        }
-        residuals.sort_by(f64::total_cmp);
-        // Median of a Rayleigh distribution is 1.18 sigma.
-        spread = residuals[residuals.len() / 2] / 1.18;
-        let trust = sure.len() as f64 / (sure.len() as f64 + 6.0);
-        field.sigma_m = (spread * trust + PRIOR_SIGMA_M * (1.0 - trust)).clamp(0.05, PRIOR_SIGMA_M);
-        field
-    }
-
-    /// Expected disparity at a place, and its standard deviation, metres.
-    fn expected(&self, view_a: usize, view_b: usize, at_m: Vector2<f64>) -> (Vector2<f64>, f64) {
-        let base = self.offset_m[view_b] - self.offset_m[view_a];
-        let Some(near) = self.local.get(&(view_a, view_b)) else { return (base, self.sigma_m) };
-        let prior = 1.0;
-        let (mut sum, mut weight) = (Vector2::zeros(), prior);
-        for (at, rest) in near {
-            // Disparities are alike within some 15 m.
-            let w = 4.0 * (-(at - at_m).norm_squared() / (2.0 * 15.0 * 15.0)).exp();
-            sum += rest * w;
-            weight += w;
-        }
-        let knowledge = (weight - prior) / weight;
-        (base + sum / weight, self.sigma_m * (1.0 - 0.5 * knowledge))
-    }
-}
-
-/// Total cost of each hypothesis of a pair.
-fn costs(pair: &Pair, pieces: &[LocatedPiece], field: &DisparityField) -> Vec<f64> {
-    let (a, b) = (&pieces[pair.a], &pieces[pair.b]);
-    let (expected, field_sigma) = field.expected(a.view, b.view, pair.at_m);
-    let sigma = (field_sigma.powi(2) + a.sigma_m.powi(2) + b.sigma_m.powi(2)).sqrt();
-    pair.hypotheses
-        .iter()
-        .map(|hypothesis| {
-            let off = (hypothesis.disparity_m - expected).norm() / sigma;
-            // Student's t in the plane: positions may be wrong by far more than they admit.
-            let position = (TAIL + 2.0) / 2.0 * (1.0 + off * off / TAIL).ln();
-            hypothesis.structure_cost + position
-        })
-        .collect()
-}
-
-fn choose(pair: &Pair, pieces: &[LocatedPiece], field: &DisparityField) -> Option<Choice> {
-    let costs = costs(pair, pieces, field);
-    let best = (0..costs.len()).min_by(|&i, &j| costs[i].total_cmp(&costs[j]))?;
-    let second = (0..costs.len()).filter(|k| *k != best).min_by(|&i, &j| costs[i].total_cmp(&costs[j]));
-    // That the two are different benches after all costs as much as two contradicted ends.
-    let apart = 2.0 * END_COST + 2.0;
-    let rival = second.map_or(apart, |second| costs[second].min(apart));
-    (pair.hypotheses[best].shares && costs[best] < apart).then_some(Choice { best, margin: rival - costs[best] })
-}
-
-/// The shift between two benches-to-be that all their undecided pairs together favour: (column, row) from piece `base.0`
-/// to `base.1`, the runner-up, and the margin.
-#[allow(clippy::type_complexity)]
-fn pooled_choice(
-    undecided: &[usize],
-    pairs: &[Pair],
-    pieces: &[LocatedPiece],
-    field: &DisparityField,
-    forest: &mut Forest,
-    base: (usize, usize),
-) -> Option<((i32, i32), Option<(i32, i32)>, f64, f64)> {
-    let mut totals: BTreeMap<(i32, i32), (f64, usize)> = BTreeMap::new();
-    let mut counted = 0;
-    let (from, to) = (forest.place(base.0), forest.place(base.1));
-    for &k in undecided {
-        let pair = &pairs[k];
-        let (mut a, mut b) = (forest.place(pair.a), forest.place(pair.b));
-        let mut sign = 1;
-        if a.0 != from.0 {
-            std::mem::swap(&mut a, &mut b);
-            sign = -1;
-        }
-        if a.0 != from.0 || b.0 != to.0 {
-            continue;
-        }
-        counted += 1;
-        for (hypothesis, cost) in pair.hypotheses.iter().zip(costs(pair, pieces, field)) {
-            // Shift between the two pieces -> shift between the two base pieces.
-            let col = sign * hypothesis.col + (a.1 - from.1) - (b.1 - to.1);
-            let row = sign * hypothesis.row + (a.2 - from.2) - (b.2 - to.2);
-            let total = totals.entry((col, row)).or_insert((0.0, 0));
-            total.0 += cost;
-            total.1 += 1;
-        }
-    }
-    let apart = 2.0 * END_COST + 2.0;
-    let mut ranked: Vec<((i32, i32), f64)> =
-        totals.into_iter().map(|(shift, (cost, times))| (shift, cost + apart * (counted - times) as f64)).collect();
-    ranked.sort_by(|p, q| p.1.total_cmp(&q.1).then(p.0.cmp(&q.0)));
-    let (best, cost) = *ranked.first()?;
-    if cost >= apart * counted as f64 {
-        return None;
-    }
-    let second = ranked.get(1).copied();
-    let margin = second.map_or(apart * counted as f64, |(_, cost)| cost) - cost;
-    Some((best, second.map(|(shift, _)| shift), margin, margin / counted as f64))
-}
-
-enum Joined {
-    New,
-    Already,
-    Conflict(i32),
-}
-
-/// Disjoint sets of pieces, each with its shift against the root's lattice.
-struct Forest {
-    parent: Vec<usize>,
-    /// Shift of a piece against its parent: parent's coordinate = own + shift.
-    shift: Vec<(i32, i32)>,
-    members: Vec<Vec<usize>>,
-    margin: Vec<f64>,
-}
-
-impl Forest {
-    fn new(pieces: &[LocatedPiece]) -> Self {
-        let count = pieces.len();
-        Self {
-            parent: (0..count).collect(),
-            shift: vec![(0, 0); count],
-            members: (0..count).map(|k| vec![k]).collect(),
-            margin: vec![f64::INFINITY; count],
-        }
-    }
-
-    fn root(&mut self, piece: usize) -> usize {
-        self.place(piece).0
-    }
-
-    /// Root, column shift and row shift of a piece; compresses the path.
-    fn place(&mut self, piece: usize) -> (usize, i32, i32) {
-        let parent = self.parent[piece];
-        if parent == piece {
-            return (piece, 0, 0);
-        }
-        let (root, col, row) = self.place(parent);
-        let own = (self.shift[piece].0 + col, self.shift[piece].1 + row);
-        self.parent[piece] = root;
-        self.shift[piece] = own;
-        (root, own.0, own.1)
-    }
-
-    /// Joins the sets of `a` and `b`, where column and row of `b` are those of `a` plus (`col`, `row`).
-    fn join(&mut self, pieces: &[LocatedPiece], a: usize, b: usize, col: i32, row: i32, margin: f64) -> Joined {
-        let ((root_a, col_a, row_a), (root_b, col_b, row_b)) = (self.place(a), self.place(b));
-        if root_a == root_b {
-            let off = (col_b + col - col_a, row_b + row - row_a);
-            return if off == (0, 0) { Joined::Already } else { Joined::Conflict(off.0) };
-        }
-        // Coordinates of root_b's set in root_a's: x_a-root = x_b-root + offset.
-        let offset = (col_a - col - col_b, row_a - row - row_b);
-        if self.collides(pieces, root_a, root_b, offset) {
-            return Joined::Conflict(0);
-        }
-        let (keep, drop, offset) = if self.members[root_a].len() >= self.members[root_b].len() {
-            (root_a, root_b, offset)
-        } else {
-            (root_b, root_a, (-offset.0, -offset.1))
-        };
-        self.parent[drop] = keep;
-        self.shift[drop] = offset;
-        let moved = std::mem::take(&mut self.members[drop]);
-        self.members[keep].extend(moved);
-        self.margin[keep] = self.margin[keep].min(self.margin[drop]).min(margin);
-        Joined::New
-    }
-
-    /// Whether two pieces of one view would show two modules at one place.
-    fn collides(&mut self, pieces: &[LocatedPiece], a: usize, b: usize, offset: (i32, i32)) -> bool {
-        let (small, large, sign) = if self.members[a].len() <= self.members[b].len() { (a, b, 1) } else { (b, a, -1) };
-        // Coordinates of `large`'s set in `small`'s.
-        let shift = if sign == 1 { offset } else { (-offset.0, -offset.1) };
-        let members_small = self.members[small].clone();
-        let members_large = self.members[large].clone();
-        for p in members_small {
-            for q in &members_large {
-                if pieces[p].view != pieces[*q].view {
-                    continue;
-                }
-                let ((_, pc, pr), (_, qc, qr)) = (self.place(p), self.place(*q));
-                // q's cell (c, r) stands at p's cell (c + qc + shift - pc).
-                let (dc, dr) = (qc + shift.0 - pc, qr + shift.1 - pr);
-                let hit = pieces[*q].cells.iter().any(|cell| {
-                    cell.detection.is_some()
-                        && pieces[p].cell(cell.row + dr, cell.col + dc).is_some_and(|other| other.detection.is_some())
-                });
-                if hit {
-                    return true;
-                }
-            }
-        }
-        false
-    }
-
-    /// Numbers the sets by their first piece and shifts each so that its lowest column and row are 0.
-    fn clusters(mut self, doubts: Vec<Undecided>) -> Clusters {
-        let count = self.parent.len();
-        let mut number: BTreeMap<usize, usize> = BTreeMap::new();
-        let mut members: Vec<Vec<usize>> = Vec::new();
-        let mut margins = Vec::new();
-        let mut placements = Vec::with_capacity(count);
-        for piece in 0..count {
-            let (root, col, row) = self.place(piece);
-            let cluster = *number.entry(root).or_insert_with(|| {
-                members.push(Vec::new());
-                margins.push(self.margin[root]);
-                members.len() - 1
-            });
-            members[cluster].push(piece);
-            placements.push(Placement { cluster, col, row });
-        }
-        for group in &members {
-            let low_col = group.iter().map(|p| placements[*p].col).min().unwrap_or(0);
-            let low_row = group.iter().map(|p| placements[*p].row).min().unwrap_or(0);
-            for piece in group {
-                placements[*piece].col -= low_col;
-                placements[*piece].row -= low_row;
-            }
-        }
-        Clusters { placements, members, margins, doubts }
-    }
 }

@@ -2,6 +2,7 @@
 //! (paper, 3.5).
 
 use super::associate::Clusters;
+use super::locate::LocatedCell;
 use super::{Doubt, LocatedPiece, View};
 use crate::layout::End;
 use nalgebra::{Vector2, Vector3};
@@ -103,18 +104,10 @@ fn assemble_bench(
         }
     }
     let places: Vec<(i32, i32)> = votes.keys().copied().collect();
-    for &member in members {
-        let (piece, place) = (&pieces[member], clusters.placements[member]);
+    for extent in Extent::of_views(pieces, clusters, members) {
         for &(row, col) in &places {
-            let (r, c) = (row - place.row, col - place.col);
-            let beyond = (c < 0 && piece.west == End::Closed)
-                || (c >= piece.cols && piece.east == End::Closed)
-                || (r < 0 && piece.north == End::Closed)
-                || (r >= piece.rows && piece.south == End::Closed);
-            // Only next to the piece is it sure to be in the image.
-            let near = (-1..=piece.cols).contains(&c) && (-1..=piece.rows).contains(&r);
-            if let Some(entry) = votes.get_mut(&(row, col)).filter(|_| beyond && near) {
-                entry.absent.insert(piece.view);
+            if extent.ends_before(row, col) && extent.shows(&views[extent.view], pieces, clusters, row, col) {
+                votes.entry((row, col)).or_default().absent.insert(extent.view);
             }
         }
     }
@@ -181,6 +174,93 @@ fn assemble_bench(
     Some(bench)
 }
 
+/// What one view shows of a bench: all its pieces together, for a bench may come in parts where modules were missed.
+struct Extent {
+    view: usize,
+    members: Vec<usize>,
+    /// First and last column and row in the bench's coordinates.
+    cols: (i32, i32),
+    rows: (i32, i32),
+    /// Whether it is seen to end there: west, east, north, south.
+    closed: [bool; 4],
+}
+
+impl Extent {
+    fn of_views(pieces: &[LocatedPiece], clusters: &Clusters, members: &[usize]) -> Vec<Self> {
+        let mut by_view: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
+        for &member in members {
+            by_view.entry(pieces[member].view).or_default().push(member);
+        }
+        by_view.into_iter().map(|(view, members)| Self::new(view, members, pieces, clusters)).collect()
+    }
+
+    fn new(view: usize, members: Vec<usize>, pieces: &[LocatedPiece], clusters: &Clusters) -> Self {
+        let mut extent =
+            Self { view, members, cols: (i32::MAX, i32::MIN), rows: (i32::MAX, i32::MIN), closed: [true; 4] };
+        let Self { members, cols, rows, closed, .. } = &mut extent;
+        for &member in members.iter() {
+            let (piece, place) = (&pieces[member], clusters.placements[member]);
+            let (col, row) = (place.col, place.row);
+            let mut side = |side: usize, farther: bool, same: bool, end: End| {
+                if farther {
+                    closed[side] = end == End::Closed;
+                } else if same {
+                    closed[side] &= end == End::Closed;
+                }
+            };
+            let (last_col, last_row) = (col + piece.cols - 1, row + piece.rows - 1);
+            side(0, col < cols.0, col == cols.0, piece.west);
+            side(1, last_col > cols.1, last_col == cols.1, piece.east);
+            side(2, row < rows.0, row == rows.0, piece.north);
+            side(3, last_row > rows.1, last_row == rows.1, piece.south);
+            *cols = (cols.0.min(col), cols.1.max(last_col));
+            *rows = (rows.0.min(row), rows.1.max(last_row));
+        }
+        extent
+    }
+
+    /// Whether a place lies past an end that the view sees.
+    fn ends_before(&self, row: i32, col: i32) -> bool {
+        (col < self.cols.0 && self.closed[0])
+            || (col > self.cols.1 && self.closed[1])
+            || (row < self.rows.0 && self.closed[2])
+            || (row > self.rows.1 && self.closed[3])
+    }
+
+    /// Whether a place past an end lies inside the image.
+    fn shows(&self, view: &View<'_>, pieces: &[LocatedPiece], clusters: &Clusters, row: i32, col: i32) -> bool {
+        let own = |member: usize| {
+            let place = clusters.placements[member];
+            (row - place.row, col - place.col)
+        };
+        let distance = |member: usize| {
+            let ((r, c), piece) = (own(member), &pieces[member]);
+            (-c).max(c - piece.cols + 1).max(0) + (-r).max(r - piece.rows + 1).max(0)
+        };
+        let Some(&member) = self.members.iter().min_by_key(|member| distance(**member)) else { return false };
+        // Next to a piece it does: otherwise the end would be cut, and not closed.
+        if distance(member) <= 1 {
+            return true;
+        }
+        let (piece, (r, c)) = (&pieces[member], own(member));
+        let off = |cell: &&LocatedCell| (cell.col - c).abs() + (cell.row - r).abs();
+        let Some(nearest) = piece.cells.iter().min_by_key(off) else { return false };
+        let pitch_m = piece.pitch_m();
+        let step = pitch_m[0] * f64::from(c - nearest.col) + pitch_m[1] * f64::from(r - nearest.row);
+        let place = nearest.position_m + Vector3::new(step.x, step.y, 0.0);
+        let camera = &view.shot.camera;
+        let Some(pixel) = camera.project(&view.shot.pose.to_camera(&place)) else { return false };
+        // As far from the frame's edge as a module is long.
+        let margin_px = piece
+            .cells
+            .iter()
+            .find_map(|cell| Some(view.detections.detections[cell.detection?].quad.sides()))
+            .map_or(0.0, |[u, v]| u.norm().max(v.norm()));
+        let inside = |at: f64, size: u32| at > margin_px && at < f64::from(size) - margin_px;
+        inside(pixel.x, camera.width_px) && inside(pixel.y, camera.height_px)
+    }
+}
+
 /// Takes out benches that stand on top of another one: the same bench once more, which the evidence could not join. The
 /// one with fewer observations goes, and it is told.
 pub fn without_ghosts(views: &[View<'_>], benches: Vec<FusedBench>, doubts: &mut Vec<Doubt>) -> Vec<FusedBench> {
@@ -221,7 +301,7 @@ pub fn without_ghosts(views: &[View<'_>], benches: Vec<FusedBench>, doubts: &mut
             let other = tree
                 .locate_within_distance([at.x, at.y], reach * reach)
                 .filter(|near| near.data != index && kept[near.data])
-                .filter(|near| !weak || view_count(&benches[near.data]) > view_count(bench))
+                .filter(|near| !weak || view_count(&benches[near.data]) >= view_count(bench))
                 .map(|near| near.data)
                 .min();
             if other.is_some() {
@@ -229,7 +309,16 @@ pub fn without_ghosts(views: &[View<'_>], benches: Vec<FusedBench>, doubts: &mut
                 over = other;
             }
         }
-        kept[index] = if weak { 2 * covered < bench.modules.len() } else { 3 * covered <= bench.modules.len() };
+        // A real one would have been seen, and joined, by the others that look there.
+        let seen_in = view_count(bench);
+        let missed_in = if weak { views_missing(views, bench) } else { 0 };
+        kept[index] = if missed_in >= 2 * seen_in {
+            false
+        } else if weak {
+            2 * covered < bench.modules.len()
+        } else {
+            3 * covered <= bench.modules.len()
+        };
         if !kept[index] {
             let names: BTreeSet<String> = bench
                 .modules
@@ -249,6 +338,35 @@ pub fn without_ghosts(views: &[View<'_>], benches: Vec<FusedBench>, doubts: &mut
         }
     }
     benches.into_iter().zip(kept).filter_map(|(bench, keep)| keep.then_some(bench)).collect()
+}
+
+/// How many views show the place of a bench, wholly in their frame, and have no part in it.
+fn views_missing(views: &[View<'_>], bench: &FusedBench) -> usize {
+    let own: BTreeSet<usize> = bench.modules.iter().flat_map(|m| m.observations.iter().map(|o| o.view)).collect();
+    let places: Vec<Vector3<f64>> = bench
+        .modules
+        .iter()
+        .map(|m| m.observations.iter().map(|o| o.position_m).sum::<Vector3<f64>>() / m.observations.len() as f64)
+        .collect();
+    // Views may be displaced by as much as poses err, and what stands at the edge is cut.
+    let margin_m = 2.0 + bench.pitch_m[0].norm().max(bench.pitch_m[1].norm());
+    (0..views.len())
+        .filter(|view| !own.contains(view))
+        .filter(|&view| {
+            let (camera, pose) = (&views[view].shot.camera, &views[view].shot.pose);
+            let inside = |place: &Vector3<f64>| {
+                let in_camera = pose.to_camera(place);
+                let margin_px = margin_m * camera.focal_px() / in_camera.z;
+                camera.project(&in_camera).is_some_and(|pixel| {
+                    pixel.x > margin_px
+                        && pixel.y > margin_px
+                        && pixel.x < f64::from(camera.width_px) - margin_px
+                        && pixel.y < f64::from(camera.height_px) - margin_px
+                })
+            };
+            inside(&bench.middle_m) && 4 * places.iter().filter(|place| inside(place)).count() > 3 * places.len()
+        })
+        .count()
 }
 
 /// Places inside the bench where no view detected a module: said, not filled.

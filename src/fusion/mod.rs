@@ -3,6 +3,8 @@
 
 pub mod associate;
 pub mod benches;
+mod cluster;
+mod disparity;
 pub mod lines;
 pub mod locate;
 pub mod repair;

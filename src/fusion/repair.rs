@@ -56,13 +56,42 @@ pub fn missed_gaps(pieces: &[LocatedPiece], clusters: &Clusters) -> Vec<Split> {
             let both = ending.intersection(&beginning).count();
             let either = ending.union(&beginning).count();
             let against = through.iter().filter(|view| !(ending.contains(view) && beginning.contains(view))).count();
-            if both > 0 && 2 * both + (either - both) > 2 * against {
+            let for_gap = if both > 0 { 2 * both + (either - both) } else { either };
+            if (both > 0 || either > 1) && for_gap > 2 * against {
                 splits.extend(spanning);
             }
         }
     }
+    splits.extend(clusters.members.iter().flat_map(|members| empty_columns(pieces, clusters, members)));
     splits.sort_unstable();
     splits.dedup();
+    splits
+}
+
+/// Columns that two views or more bridge, and in which none ever saw a module: missed modules would be seen by some
+/// view, so this is a gap that happens to be a whole number of modules wide.
+fn empty_columns(pieces: &[LocatedPiece], clusters: &Clusters, members: &[usize]) -> Vec<Split> {
+    if members.iter().all(|member| pieces[*member].bridges.is_empty()) {
+        return Vec::new();
+    }
+    let mut seen: BTreeSet<i32> = BTreeSet::new();
+    for &member in members {
+        let cells = pieces[member].cells.iter().filter(|cell| cell.detection.is_some());
+        seen.extend(cells.map(|cell| cell.col + clusters.placements[member].col));
+    }
+    let (Some(&first), Some(&last)) = (seen.first(), seen.last()) else { return Vec::new() };
+    let mut splits = Vec::new();
+    for col in (first..last).filter(|col| seen.contains(col) && !seen.contains(&(col + 1))) {
+        let across: Vec<Split> = members
+            .iter()
+            .map(|&piece| Split { piece, after_col: col - clusters.placements[piece].col })
+            .filter(|split| (0..pieces[split.piece].cols - 1).contains(&split.after_col))
+            .collect();
+        let views: BTreeSet<usize> = across.iter().map(|split| pieces[split.piece].view).collect();
+        if views.len() > 1 {
+            splits.extend(across);
+        }
+    }
     splits
 }
 

@@ -107,7 +107,7 @@ pub(super) fn grow(
     grown.retain(|component| component.places.len() >= 2);
     orient(&mut grown, &nodes);
     let mut used = vec![false; nodes.len()];
-    let pieces: Vec<Piece> = grown
+    let mut pieces: Vec<Piece> = grown
         .iter()
         .map(|component| {
             for node in component.places.values() {
@@ -116,8 +116,60 @@ pub(super) fn grow(
             piece(component, &nodes, detections)
         })
         .collect();
+    open_torn_ends(&mut pieces);
     let loose = (0..nodes.len()).filter(|node| !used[*node]).collect();
     (pieces, loose)
+}
+
+/// Where another piece stands on the lattice of this one, a few whole columns further on, neither is sure to end: modules
+/// may be missed between them as well as a gap may happen to be as wide.
+fn open_torn_ends(pieces: &mut [Piece]) {
+    /// Further off no lattice is known well enough, columns.
+    const NEAR: f64 = 9.0;
+    let mut open: Vec<(usize, bool)> = Vec::new();
+    for (i, base) in pieces.iter().enumerate() {
+        let [u, v] = base.map.pitch(f64::from(base.cols - 1) / 2.0, f64::from(base.rows - 1) / 2.0);
+        let reach_px = u.norm() * (f64::from(base.cols) / 2.0 + NEAR) + v.norm() * f64::from(base.rows);
+        let middle = base.map.pixel(f64::from(base.cols - 1) / 2.0, f64::from(base.rows - 1) / 2.0);
+        for (j, part) in pieces.iter().enumerate() {
+            if i == j || base.cells.len() < part.cells.len() {
+                continue;
+            }
+            for (col, inner) in [(0, End::Closed), (part.cols - 1, End::Closed)] {
+                let west_end = col == 0;
+                if (if west_end { part.west } else { part.east }) != inner {
+                    continue;
+                }
+                let ends = part.detected().filter(|(cell, _)| cell.col == col);
+                let on_lattice = ends.into_iter().any(|(cell, _)| {
+                    let center = cell.quad.center();
+                    if (center - middle).norm() > reach_px {
+                        return false;
+                    }
+                    let Some(at) = base.map.coordinate(center) else { return false };
+                    let beyond = if west_end { at.x - f64::from(base.cols - 1) } else { -at.x };
+                    let off = Vector2::new((at.x - at.x.round()) * u.norm(), (at.y - at.y.round()) * v.norm());
+                    let allowed = (0.12 + 0.02 * beyond) * u.norm().min(v.norm());
+                    (0.5..NEAR).contains(&beyond)
+                        && (-0.5..f64::from(base.rows) - 0.5).contains(&at.y)
+                        && off.x.abs() < allowed
+                        && off.y.abs() < allowed
+                });
+                if on_lattice {
+                    // The west end of one faces the east end of the other.
+                    open.push((j, west_end));
+                    open.push((i, !west_end));
+                }
+            }
+        }
+    }
+    for (piece, west) in open {
+        if west {
+            pieces[piece].west = End::Cut;
+        } else {
+            pieces[piece].east = End::Cut;
+        }
+    }
 }
 
 /// The mutual nearest neighbours of every module in its four directions.
@@ -461,6 +513,8 @@ fn attachment(
     let (col_low, col_high) = base.col_range();
     let (row_low, row_high) = base.row_range();
     let reach = f64::from(options.max_missing + 2);
+    // Gaps are as wide as the shorter side tells, however long the modules are along the row.
+    let narrow = (base_sides[0].norm().min(base_sides[1].norm()) / base_sides[0].norm()).min(1.0);
     let mut shift = None;
     for ((col, row), node) in &part.places {
         let at = map.coordinate(nodes[*node].center)?;
@@ -478,7 +532,7 @@ fn attachment(
             return None;
         }
         let (off_col, off_row) = (at.x - f64::from(place.0), at.y - f64::from(place.1));
-        if outside < reach && (off_col.abs() > tolerance || off_row.abs() > 0.25) {
+        if outside < reach && (off_col.abs() > tolerance * narrow || off_row.abs() > 0.25) {
             return None;
         }
     }

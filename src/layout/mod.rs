@@ -50,7 +50,7 @@ pub struct Cell {
 pub enum End {
     /// The next module would lie wholly inside the image, and none is there.
     Closed,
-    /// The image ends before the bench may do.
+    /// The image ends before the bench may do, or more of the same lattice follows after a distance of whole modules.
     Cut,
 }
 
