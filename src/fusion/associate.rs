@@ -32,7 +32,7 @@ const DIFFERENT_COST: f64 = 2.0 * END_COST + 2.0;
 /// Cost of a shift that positions do not allow.
 const FAR_COST: f64 = 12.0;
 /// Cost of two pieces of one image, with a gap between them that is no whole number of modules, in one bench.
-const GAP_COST: f64 = 6.0;
+const GAP_COST: f64 = 12.0;
 /// Degrees of freedom of the positions' errors: few, for local errors of structure from motion have long tails.
 const TAIL: f64 = 4.0;
 

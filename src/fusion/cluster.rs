@@ -111,9 +111,7 @@ pub(super) fn partition(pieces: &[LocatedPiece], links: &[Link], least_margin: f
             break;
         }
     }
-    for piece in 0..pieces.len() {
-        partition.margin[piece] = partition.margin_of(links, &of_piece[piece], piece);
-    }
+    partition.margin = of_piece.iter().enumerate().map(|(piece, own)| partition.margin_of(links, own, piece)).collect();
     partition
 }
 

@@ -21,8 +21,15 @@ pub(super) struct Disparity {
 pub(super) struct DisparityField {
     offset_m: Vec<Vector2<f64>>,
     sigma_m: f64,
-    /// What is left for each pair of views: pair, place, residual.
-    local: BTreeMap<(usize, usize), Vec<(usize, Vector2<f64>, Vector2<f64>)>>,
+    /// What is left for each pair of views.
+    local: BTreeMap<(usize, usize), Vec<Residual>>,
+}
+
+/// What the displacements of the views leave of one disparity, metres.
+struct Residual {
+    pair: usize,
+    at_m: Vector2<f64>,
+    rest_m: Vector2<f64>,
 }
 
 impl DisparityField {
@@ -59,7 +66,11 @@ impl DisparityField {
             let (a, b) = disparity.views;
             let rest = disparity.value_m - (field.offset_m[b] - field.offset_m[a]);
             residuals.push(rest.norm());
-            field.local.entry((a, b)).or_default().push((disparity.pair, disparity.at_m, rest));
+            field.local.entry((a, b)).or_default().push(Residual {
+                pair: disparity.pair,
+                at_m: disparity.at_m,
+                rest_m: rest,
+            });
         }
         residuals.sort_by(f64::total_cmp);
         // Median of a Rayleigh distribution is 1.18 sigma.
@@ -75,9 +86,9 @@ impl DisparityField {
         let Some(near) = self.local.get(&views) else { return (base, self.sigma_m) };
         let prior = 1.0;
         let (mut sum, mut weight) = (Vector2::zeros(), prior);
-        for (_, at, rest) in near.iter().filter(|(index, _, _)| *index != pair) {
-            let w = 4.0 * (-(at - at_m).norm_squared() / (2.0 * ALIKE_M * ALIKE_M)).exp();
-            sum += rest * w;
+        for residual in near.iter().filter(|residual| residual.pair != pair) {
+            let w = 4.0 * (-(residual.at_m - at_m).norm_squared() / (2.0 * ALIKE_M * ALIKE_M)).exp();
+            sum += residual.rest_m * w;
             weight += w;
         }
         let knowledge = (weight - prior) / weight;

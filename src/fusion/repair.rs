@@ -18,18 +18,26 @@ pub struct Split {
 pub fn missed_gaps(pieces: &[LocatedPiece], clusters: &Clusters) -> Vec<Split> {
     let mut splits = Vec::new();
     for members in &clusters.members {
-        // Column after which a piece ends or before which one begins -> views that say so.
-        let mut ends: BTreeMap<i32, (BTreeSet<usize>, BTreeSet<usize>)> = BTreeMap::new();
+        // Column after which a piece ends, and after which the next one begins -> views that say so.
+        let mut ends: BTreeMap<i32, BTreeSet<usize>> = BTreeMap::new();
+        let mut begins: BTreeMap<i32, BTreeSet<usize>> = BTreeMap::new();
         for &member in members {
             let (piece, place) = (&pieces[member], clusters.placements[member]);
             if piece.east == End::Closed {
-                ends.entry(place.col + piece.cols - 1).or_default().0.insert(piece.view);
+                ends.entry(place.col + piece.cols - 1).or_default().insert(piece.view);
             }
             if piece.west == End::Closed {
-                ends.entry(place.col - 1).or_default().1.insert(piece.view);
+                begins.entry(place.col - 1).or_default().insert(piece.view);
             }
         }
-        for (after, (ending, beginning)) in ends {
+        let places: BTreeSet<i32> = ends.keys().chain(begins.keys()).copied().collect();
+        for after in places {
+            let ending = ends.get(&after).cloned().unwrap_or_default();
+            let mut beginning = begins.get(&after).cloned().unwrap_or_default();
+            if !ending.is_empty() {
+                // A gap of more than half a module puts the next bench a column further.
+                beginning.extend(begins.get(&(after + 1)).into_iter().flatten());
+            }
             let mut through = BTreeSet::new();
             let mut spanning = Vec::new();
             for &member in members {
@@ -68,8 +76,8 @@ pub fn missed_gaps(pieces: &[LocatedPiece], clusters: &Clusters) -> Vec<Split> {
     splits
 }
 
-/// Columns that two views or more bridge, and in which none ever saw a module: missed modules would be seen by some
-/// view, so this is a gap that happens to be a whole number of modules wide.
+/// Columns that two views or more bridge, or at which two or more see the benches end, and in which none ever saw a
+/// module: missed modules would be seen by some view, so this is a gap.
 fn empty_columns(pieces: &[LocatedPiece], clusters: &Clusters, members: &[usize]) -> Vec<Split> {
     if members.iter().all(|member| pieces[*member].bridges.is_empty()) {
         return Vec::new();
@@ -87,7 +95,14 @@ fn empty_columns(pieces: &[LocatedPiece], clusters: &Clusters, members: &[usize]
             .map(|&piece| Split { piece, after_col: col - clusters.placements[piece].col })
             .filter(|split| (0..pieces[split.piece].cols - 1).contains(&split.after_col))
             .collect();
-        let views: BTreeSet<usize> = across.iter().map(|split| pieces[split.piece].view).collect();
+        let next = seen.range(col + 1..).next().copied().unwrap_or(last);
+        let ending = members.iter().filter(|&&member| {
+            let (piece, place) = (&pieces[member], clusters.placements[member]);
+            (piece.east == End::Closed && place.col + piece.cols - 1 == col)
+                || (piece.west == End::Closed && place.col == next)
+        });
+        let bridging = across.iter().map(|split| split.piece);
+        let views: BTreeSet<usize> = ending.copied().chain(bridging).map(|piece| pieces[piece].view).collect();
         if views.len() > 1 {
             splits.extend(across);
         }
