@@ -30,7 +30,7 @@ HEAD = """# {name}
 
 Version {version}, {size:.1f} MB, {steps} steps of training. Written by `python -m training.evaluate`: do not edit.
 
-{what}| working distance | {gsd} m per pixel; trained for {gsd_range} m (a module's short side 9 to 44 pixels) |
+{what}| working distance | {gsd_range} m per pixel; photos outside of it are scaled to {gsd} m. Trained for modules whose short side is 9 to 44 pixels |
 | speed | {speed:.2f} s per megapixel, ONNX Runtime, {threads} threads, {kind}, best of eight 1344 x 896 images in the run that wrote this card |
 
 Metadata of the file (`heliomap.*`) says the same to programs. From the outputs to boxes: `training/{post}`.
