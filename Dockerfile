@@ -27,7 +27,6 @@ COPY --from=build /heliomap/target/release/heliomap /usr/local/bin/heliomap
 COPY --from=build /heliomap/.ort/libonnxruntime.so /usr/local/lib/libonnxruntime.so
 COPY models/ /usr/local/share/heliomap/models/
 ENV ORT_DYLIB_PATH=/usr/local/lib/libonnxruntime.so \
-    HELIOMAP_DETECTOR=/usr/local/share/heliomap/models/unet.onnx \
     HELIOMAP_DATA_DIR=/data \
     HELIOMAP_LISTEN=0.0.0.0:8080 \
     HELIOMAP_LOG_FORMAT=json

@@ -17,7 +17,7 @@ export ORT_DYLIB_PATH ?= $(abspath $(ORT_LIBRARY))
 HELIOMAP_DATA ?= $(wildcard ../shared/data)
 export HELIOMAP_DATA
 
-.PHONY: help setup web demo test lint unit kills structure bench openapi clean
+.PHONY: help setup web demo test lint unit kills structure bench yolo-export openapi clean
 
 help: ## List the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -61,6 +61,23 @@ structure: setup ## Survey of every kind of simulated layout: how many come out 
 
 bench: setup ## Benchmarks of layout, locate, fusion and refinement
 	$(CARGO) bench --locked
+
+# Of its own, because the package and PyTorch are large. Its licence is AGPL: nothing of it is kept.
+ULTRALYTICS_VERSION := 8.4.190
+YOLO_CHECK := target/yolo-export
+
+yolo-export: setup ## Build and export an untrained network of the YOLOv8-seg family, and decode it
+	rm -rf $(YOLO_CHECK) && mkdir -p $(YOLO_CHECK)
+	$(PYTHON) -m venv $(YOLO_CHECK)/venv
+	$(YOLO_CHECK)/venv/bin/pip install --quiet --disable-pip-version-check ultralytics==$(ULTRALYTICS_VERSION) onnx onnxruntime
+	$(CARGO) build --locked
+	cd $(YOLO_CHECK) && YOLO_CONFIG_DIR=. venv/bin/python $(CURDIR)/tests/fixtures/detection/export_yolo.py \
+	  $(CURDIR)/examples/plant/images/DJI_0001.jpg
+	cd $(YOLO_CHECK) && for model in fixed.onnx dynamic.onnx; do \
+	  $(CURDIR)/target/debug/heliomap detect photo.png --gsd 0.045 --detector $$model --out $$model.json; \
+	  venv/bin/python $(CURDIR)/tests/fixtures/detection/check_yolo.py $$model $$model.json; \
+	done
+	rm -rf $(YOLO_CHECK)
 
 openapi: ## Write openapi.yaml anew from the code
 	$(CARGO) run --locked --quiet -- openapi > openapi.yaml.new && mv openapi.yaml.new openapi.yaml

@@ -100,7 +100,7 @@ def start_service(binary: Path, keep: bool) -> tuple[subprocess.Popen, str]:
     log = open(OUT / "service.log", "w")
     service = subprocess.Popen(
         [str(binary), "serve", "--insecure", "--listen", f"127.0.0.1:{port_for(keep)}", "--data-dir", str(data),
-         "--detector", str(ROOT / "models" / "unet.onnx")],
+         "--detector", f"{ROOT}/models/unet.onnx,{ROOT}/models/yolo.onnx"],
         stdout=subprocess.PIPE, stderr=log, text=True, start_new_session=True,
     )
     line = service.stdout.readline()

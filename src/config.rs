@@ -1,5 +1,6 @@
 //! The command line: flags, each with an environment variable, parsed once.
 
+use crate::detection::{self, DetectionError, Detector, ExecutionProvider, RuntimeSettings};
 use crate::plant::PlantId;
 use crate::store::{KeyId, Scope};
 use clap::{Args, Subcommand, ValueEnum};
@@ -140,9 +141,23 @@ pub struct StorageArgs {
 /// What finds modules in photos.
 #[derive(Debug, Clone, Args)]
 pub struct DetectorArgs {
-    /// The detector's ONNX file.
-    #[arg(long, env = "HELIOMAP_DETECTOR", default_value = "models/unet.onnx", value_name = "FILE")]
-    pub detector: PathBuf,
+    /// The detector: `unet`, `yolo` or `both` (they come with heliomap), or ONNX files of your own, one of each kind at most.
+    #[arg(long, env = "HELIOMAP_DETECTOR", default_value = "both", value_delimiter = ',', value_name = "DETECTOR")]
+    pub detector: Vec<String>,
+    /// What runs the detector: cpu, or cuda, tensorrt, migraphx, openvino, xnnpack, coreml, directml where
+    /// your ONNX Runtime (ORT_DYLIB_PATH) was built with it.
+    #[arg(long, env = "HELIOMAP_EXECUTION_PROVIDER", default_value = "cpu", value_name = "PROVIDER")]
+    pub execution_provider: ExecutionProvider,
+}
+
+impl DetectorArgs {
+    /// Opens the detector, which runs on so many threads; 0 is one per core.
+    ///
+    /// # Errors
+    /// As [`detection::open`].
+    pub fn open(&self, threads: usize) -> Result<Box<dyn Detector>, DetectionError> {
+        detection::open(&self.detector, RuntimeSettings { threads, provider: self.execution_provider })
+    }
 }
 
 /// How much one client may ask for. Sizes take the endings K, M, G and T (powers of 1024).

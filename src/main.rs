@@ -26,8 +26,12 @@ enum Command {
     Keys(KeysArgs),
     /// Map the plant in a folder as OpenSfM leaves it; no server is needed.
     Map(commands::map::MapArgs),
+    /// Find the modules in photos and write their boxes.
+    Detect(commands::detect::DetectArgs),
     /// Compare a plant with a truth or any reference model.
     Evaluate(commands::evaluate::EvaluateArgs),
+    /// Measure a detector, or a file of boxes, against labelled photos.
+    EvaluateDetection(commands::evaluate_detection::EvaluateDetectionArgs),
     /// Print the description of the HTTP API.
     Openapi(OpenapiArgs),
 }
@@ -40,6 +44,8 @@ fn main() -> anyhow::Result<()> {
         Command::Worker(args) => commands::worker::run(args),
         Command::Keys(args) => commands::keys::run(args),
         Command::Map(args) => commands::map::run(&args),
+        Command::Detect(args) => commands::detect::run(&args),
+        Command::EvaluateDetection(args) => commands::evaluate_detection::run(&args),
         Command::Evaluate(args) => commands::evaluate::run(&args),
         Command::Openapi(args) => commands::openapi::run(&args),
     }

@@ -1,6 +1,7 @@
 //! Pictures of a mapping for people: detections, rows, gaps, hypotheses and identifiers on the photos, and the plant from
 //! above (the paper's optional intermediate outputs).
 
+use crate::detection::{Detection, Source};
 use crate::geometry::Quad;
 use crate::layout::Layout;
 use crate::pipeline::Mapping;
@@ -42,6 +43,44 @@ pub fn draw(mapping: &Mapping, folder: &Path) -> Result<(), OverlayError> {
         write(&picture, &folder.join(format!("{stem}.png")))?;
     }
     write(&plan(&mapping.model), &folder.join("plant.png"))
+}
+
+/// Draws boxes over a photo, for people who tune flights and models: the U-Net's green, YOLO's magenta, others blue, each
+/// with a dot in its middle; and, where a truth is known, missed modules red and false boxes orange.
+pub fn draw_boxes(photo: &RgbImage, detections: &[Detection], missed: &[Quad], wrong: &[Quad]) -> RgbImage {
+    let scale = LEAST_WIDTH_PX.div_ceil(photo.width().max(1)).clamp(1, 8);
+    let mut canvas = image::imageops::resize(
+        photo,
+        photo.width() * scale,
+        photo.height() * scale,
+        image::imageops::FilterType::Triangle,
+    );
+    let at = |p: Vector2<f64>| (p + Vector2::repeat(0.5)) * f64::from(scale) - Vector2::repeat(0.5);
+    for detection in detections {
+        let color = match detection.source {
+            Source::Unet => GREEN,
+            Source::Yolo => MAGENTA,
+            Source::External => color(0),
+        };
+        outline(&mut canvas, &detection.quad.map(at), color, 1);
+        let center = at(detection.quad.center());
+        line(&mut canvas, center - Vector2::new(1.0, 0.0), center + Vector2::new(1.0, 0.0), color, 2);
+    }
+    for (quads, color) in [(missed, RED), (wrong, ORANGE)] {
+        for quad in quads {
+            outline(&mut canvas, &quad.map(at), color, 3);
+        }
+    }
+    canvas
+}
+
+/// Writes a picture, into a folder that is made where it is missing.
+///
+/// # Errors
+/// A folder or a file that cannot be made.
+pub fn write_into(folder: &Path, name: &str, picture: &RgbImage) -> Result<(), OverlayError> {
+    std::fs::create_dir_all(folder).map_err(|source| OverlayError::Folder { path: folder.to_owned(), source })?;
+    write(picture, &folder.join(name))
 }
 
 fn write(picture: &RgbImage, path: &Path) -> Result<(), OverlayError> {
@@ -205,6 +244,7 @@ fn plan(model: &PlantModel) -> RgbImage {
     canvas
 }
 
+const GREEN: Rgb<u8> = Rgb([60, 255, 60]);
 const RED: Rgb<u8> = Rgb([230, 30, 30]);
 const ORANGE: Rgb<u8> = Rgb([255, 150, 0]);
 const WHITE: Rgb<u8> = Rgb([255, 255, 255]);

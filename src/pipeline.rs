@@ -7,14 +7,14 @@ use crate::geometry::PointCloud;
 use crate::layout::{self, Layout, LayoutOptions};
 use crate::plant::assemble::{Identity, assemble};
 use crate::plant::{PlantId, PlantModel, Warning};
-use crate::reconstruction::{self, Photo, Project, ReadError, Shot};
+use crate::reconstruction::{self, Photo, PhotoError, Project, ReadError, Shot};
 use crate::refinement::{self, RefinedBench, RefinementOptions};
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 use std::path::Path;
-use std::sync::Arc;
-use std::sync::mpsc::sync_channel;
+use std::sync::mpsc::{SyncSender, sync_channel};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 /// Images coarser than this do not resolve modules well enough to be searched, metres per pixel: a module of 1 m is then
@@ -318,6 +318,18 @@ pub fn map_folder(
     Ok(Mapping { model, timings, photos, shots, detections, layouts, fused, refined })
 }
 
+/// The photos of a folder as OpenSfM leaves it, with the ground sampling distance of each in metres per pixel where the
+/// reconstruction tells: what [`map_folder`] searches, by resolution still unsorted.
+///
+/// # Errors
+/// Broken input, by file.
+pub fn photos_of(folder: &Path, max_image_pixels: u64) -> Result<Vec<(Photo, Option<f64>)>, MapError> {
+    let mut project = reconstruction::opensfm::read(folder, max_image_pixels)?;
+    let cloud = cloud_of(&mut project);
+    let gsd_m = ground_sampling_distances(&project.reconstruction.shots, &cloud);
+    Ok(project.photos.into_iter().zip(gsd_m).collect())
+}
+
 /// The points that modules are located by: the dense cloud, taken out of the project, or the sparse points where there is
 /// none.
 fn cloud_of(project: &mut Project) -> PointCloud {
@@ -414,8 +426,18 @@ struct Seen {
     layout: Layout,
 }
 
-/// Detects and lays out image by image: while one image is searched, the next is decoded and the last is laid out, so
-/// that no more than a few images are in memory at once.
+/// Images that are searched at once: while one is measured out, the networks have the next.
+const IN_FLIGHT: usize = 2;
+
+/// An image between two steps.
+struct Passed {
+    shot: usize,
+    image: image::RgbImage,
+    detections: ImageDetections,
+}
+
+/// Detects and lays out image by image: while some are searched, the next is decoded and the last is laid out, so that no
+/// more than a few images are in memory at once.
 fn search_images(
     project: &Project,
     chosen: &[usize],
@@ -427,35 +449,15 @@ fn search_images(
     let start = Instant::now();
     let total = chosen.len();
     let (mut seen, sought): (Vec<Seen>, Vec<usize>) = recalled(project, chosen, observer);
-    let known = seen.len();
-    observer.progress(Stage::Detect, known, total);
-    let (fresh, layout_time) = std::thread::scope(|scope| -> Result<(Vec<Seen>, Duration), MapError> {
-        let (decoded_sender, decoded) = sync_channel(1);
-        let sought = &sought;
-        scope.spawn(move || {
-            for &shot in sought {
-                let image = project.photos[shot].load();
-                if decoded_sender.send((shot, image)).is_err() {
-                    break;
-                }
-            }
-        });
-        let (found_sender, found) = sync_channel::<(usize, image::RgbImage, ImageDetections)>(1);
-        let laying_out = scope.spawn(move || {
-            let mut seen = Vec::with_capacity(sought.len());
-            let mut spent = Duration::ZERO;
-            for (shot, image, detections) in found {
-                let start = Instant::now();
-                let grey = image::imageops::grayscale(&image);
-                let layout = layout::infer(&detections, Some(&grey), &LayoutOptions::default());
-                let found = Found { detections, layout };
-                observer.found(&found);
-                seen.push(Seen { shot, detections: found.detections, layout: found.layout });
-                spent += start.elapsed();
-            }
-            (seen, spent)
-        });
-        for (done, (shot, image)) in decoded.iter().enumerate() {
+    observer.progress(Stage::Detect, seen.len(), total);
+    let done = Mutex::new(seen.len());
+    let (decoded_sender, decoded) = sync_channel::<(usize, Result<image::RgbImage, PhotoError>)>(1);
+    let (found_sender, found) = sync_channel::<Passed>(1);
+    // Taken away by the first worker that fails, so that decoding ends, too.
+    let decoded = Mutex::new(Some(decoded));
+    let next = || decoded.lock().unwrap_or_else(PoisonError::into_inner).as_ref()?.recv().ok();
+    let search = |found: &SyncSender<Passed>| -> Result<(), MapError> {
+        while let Some((shot, image)) = next() {
             if observer.cancelled() {
                 return Err(MapError::Cancelled);
             }
@@ -466,18 +468,58 @@ fn search_images(
                 height_px: image.height(),
                 detections: detector.detect(&image, gsd_m[shot])?,
             };
-            if found_sender.send((shot, image, detections)).is_err() {
+            if found.send(Passed { shot, image, detections }).is_err() {
                 break;
             }
-            observer.progress(Stage::Detect, known + done + 1, total);
+            let mut done = done.lock().unwrap_or_else(PoisonError::into_inner);
+            *done += 1;
+            observer.progress(Stage::Detect, *done, total);
         }
+        Ok(())
+    };
+    let end_decoding = || drop(decoded.lock().unwrap_or_else(PoisonError::into_inner).take());
+    let work = |found: SyncSender<Passed>| search(&found).inspect_err(|_| end_decoding());
+    let unexpected = |what: &str| MapError::Environment { message: format!("{what} an image failed unexpectedly") };
+    let sought = &sought;
+    let (fresh, layout_time) = std::thread::scope(|scope| -> Result<(Vec<Seen>, Duration), MapError> {
+        scope.spawn(move || {
+            for &shot in sought {
+                let image = project.photos[shot].load();
+                if decoded_sender.send((shot, image)).is_err() {
+                    break;
+                }
+            }
+        });
+        let laying_out = scope.spawn(move || {
+            let mut seen = Vec::with_capacity(sought.len());
+            let mut spent = Duration::ZERO;
+            for Passed { shot, image, detections } in found {
+                let start = Instant::now();
+                let grey = image::imageops::grayscale(&image);
+                let layout = layout::infer(&detections, Some(&grey), &LayoutOptions::default());
+                let found = Found { detections, layout };
+                observer.found(&found);
+                seen.push(Seen { shot, detections: found.detections, layout: found.layout });
+                spent += start.elapsed();
+            }
+            (seen, spent)
+        });
+        let workers: Vec<_> = (0..IN_FLIGHT)
+            .map(|_| {
+                let (work, found) = (&work, found_sender.clone());
+                scope.spawn(move || work(found))
+            })
+            .collect();
         drop(found_sender);
-        laying_out
-            .join()
-            .map_err(|_| MapError::Environment { message: "laying out an image failed unexpectedly".to_owned() })
+        let outcomes: Vec<Result<(), MapError>> =
+            workers.into_iter().map(|worker| worker.join().unwrap_or_else(|_| Err(unexpected("searching")))).collect();
+        end_decoding();
+        outcomes.into_iter().collect::<Result<(), MapError>>()?;
+        laying_out.join().map_err(|_| unexpected("laying out"))
     })?;
+    // In the order of the shots, whichever was done first.
     seen.extend(fresh);
-    seen.sort_by_key(|seen| seen.shot);
+    seen.sort_by_key(|image| image.shot);
     let wall = start.elapsed();
     clock.add(Stage::Detect, wall.saturating_sub(layout_time));
     clock.add(Stage::Layout, layout_time);

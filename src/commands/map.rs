@@ -2,7 +2,7 @@
 
 use anyhow::{Context, bail};
 use clap::Args;
-use heliomap::detection::Unet;
+use heliomap::config::DetectorArgs;
 use heliomap::overlay;
 use heliomap::pipeline::{self, Boxes, MapOptions, Observer, Stage, Subject};
 use heliomap::plant::{Layer, PlantId, PlantModel};
@@ -33,9 +33,8 @@ pub struct MapArgs {
     /// Take these boxes instead of searching the images (the form that detectors write)
     #[arg(long, value_name = "FILE")]
     detections: Option<PathBuf>,
-    /// Detector, an ONNX file
-    #[arg(long, env = "HELIOMAP_DETECTOR", value_name = "FILE", default_value = "models/unet.onnx")]
-    detector: PathBuf,
+    #[command(flatten)]
+    detector: DetectorArgs,
     /// Threads to use; all cores where it is not given
     #[arg(long, env = "HELIOMAP_THREADS", value_name = "N")]
     threads: Option<usize>,
@@ -116,11 +115,11 @@ pub fn run(args: &MapArgs) -> anyhow::Result<()> {
 
     let detector = match args.detections {
         Some(_) => None,
-        None => Some(Unet::open(&args.detector, threads)?),
+        None => Some(args.detector.open(threads)?),
     };
     let boxes = match (&args.detections, &detector) {
         (Some(file), _) => Boxes::File(file),
-        (None, Some(detector)) => Boxes::Detector(detector),
+        (None, Some(detector)) => Boxes::Detector(&**detector),
         (None, None) => bail!("neither a detector nor boxes were given"),
     };
     let report = Report::new();
@@ -174,7 +173,7 @@ pub fn run(args: &MapArgs) -> anyhow::Result<()> {
 }
 
 /// Writes a file whole or not at all.
-fn write_json(path: &Path, value: &Value) -> anyhow::Result<()> {
+pub fn write_json(path: &Path, value: &Value) -> anyhow::Result<()> {
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let what = || format!("writing {}", path.display());
     std::fs::create_dir_all(folder).with_context(what)?;

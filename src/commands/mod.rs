@@ -1,6 +1,8 @@
 //! One file per command. Here alone, concrete backends are named.
 
+pub mod detect;
 pub mod evaluate;
+pub mod evaluate_detection;
 pub mod keys;
 pub mod map;
 pub mod openapi;
@@ -9,11 +11,9 @@ pub mod worker;
 
 use anyhow::Context;
 use heliomap::config::{DetectorArgs, JobArgs, StorageArgs};
-use heliomap::detection::{DetectionError, Detector, Unet};
 use heliomap::jobs::{PipelineMapper, Worker, WorkerSettings};
 use heliomap::store::{Blobs, SqliteStore, Store, UploadStore};
 use jiff::Timestamp;
-use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::Notify;
@@ -54,16 +54,10 @@ fn pipeline_worker(
         name: format!("{}-{}", std::process::id(), &uuid::Uuid::new_v4().simple().to_string()[..8]),
         store,
         blobs,
-        mapper: Arc::new(PipelineMapper::new(Box::new(move || open_detector(&detector.detector)))),
+        mapper: Arc::new(PipelineMapper::new(Box::new(move || Ok(detector.open(0)?.into())))),
         settings: WorkerSettings::with_lease(jobs.lease),
         bell,
     }
-}
-
-/// The detector of an ONNX file.
-fn open_detector(path: &Path) -> Result<Arc<dyn Detector>, DetectionError> {
-    let threads = std::thread::available_parallelism().map_or(2, usize::from);
-    Ok(Arc::new(Unet::open(path, threads)?))
 }
 
 /// Runs a service until its end; what then still runs is given a moment and left behind.

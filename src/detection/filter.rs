@@ -9,9 +9,9 @@ use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
 /// Least mean `module` inside a box.
 const MODULE: f64 = 0.5;
 /// Range of areas, in parts of the representative box's.
-const SIZE: (f64, f64) = (0.45, 2.0);
+pub(super) const SIZE: (f64, f64) = (0.45, 2.0);
 /// The largest share of the smaller of two boxes that may overlap (paper: 20 %).
-const OVERLAP: f64 = 0.2;
+pub(super) const OVERLAP: f64 = 0.2;
 /// Score from which a box needs no neighbour.
 const ALONE: f32 = 0.9;
 /// Tolerance of a neighbour's place, in modules.
@@ -34,9 +34,13 @@ pub fn plausible(boxes: Vec<ModuleBox>, module: &ProbabilityMap) -> Vec<ModuleBo
         .filter(|b| (SIZE.0 * representative..SIZE.1 * representative).contains(&b.area_px2()))
         .filter(|b| inside_mean(module, b) > MODULE)
         .collect();
-    let apart = without_overlaps(mend_odd_ones(sized));
-    let neighbours = lattice_neighbours(&apart);
-    apart.into_iter().zip(neighbours).filter(|(b, near)| !near.is_empty() || b.score > ALONE).map(|(b, _)| b).collect()
+    without_overlaps(mend_odd_ones(sized))
+}
+
+/// Without the weak boxes that stand alone: a good one needs no neighbour.
+pub fn supported(boxes: Vec<ModuleBox>) -> Vec<ModuleBox> {
+    let neighbours = lattice_neighbours(&boxes);
+    boxes.into_iter().zip(neighbours).filter(|(b, near)| !near.is_empty() || b.score > ALONE).map(|(b, _)| b).collect()
 }
 
 /// An odd box that stands in the lattice of others takes their shape; one that does not is dropped.
@@ -159,7 +163,7 @@ pub fn without_overlaps(mut boxes: Vec<ModuleBox>) -> Vec<ModuleBox> {
 }
 
 /// The boxes that stand where the lattice of modules has the four neighbours of each box.
-fn lattice_neighbours(boxes: &[ModuleBox]) -> Vec<Vec<usize>> {
+pub(super) fn lattice_neighbours(boxes: &[ModuleBox]) -> Vec<Vec<usize>> {
     let longest = boxes.iter().map(|b| b.u.norm()).fold(0.0, f64::max);
     let grid = Grid::new(boxes.iter().map(|b| b.center).collect(), longest);
     boxes
@@ -189,9 +193,16 @@ pub fn is_inside_frame(corners: &[Vector2<f64>; 4], width: u32, height: u32) -> 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::detection::Source;
 
     fn upright(x: f64, y: f64, score: f32) -> ModuleBox {
-        ModuleBox { center: Vector2::new(x, y), u: Vector2::new(20.0, 0.0), v: Vector2::new(0.0, 10.0), score }
+        ModuleBox {
+            center: Vector2::new(x, y),
+            u: Vector2::new(20.0, 0.0),
+            v: Vector2::new(0.0, 10.0),
+            score,
+            source: Source::Unet,
+        }
     }
 
     #[test]
@@ -211,7 +222,7 @@ mod tests {
             upright(48.0, 50.0, 0.6),
             upright(120.0, 50.0, 0.95),
         ];
-        let mut places: Vec<f64> = plausible(boxes, &module).iter().map(|b| b.center.x).collect();
+        let mut places: Vec<f64> = supported(plausible(boxes, &module)).iter().map(|b| b.center.x).collect();
         places.sort_by(f64::total_cmp);
         assert_eq!(places, [20.0, 40.4, 120.0]);
     }
@@ -224,6 +235,7 @@ mod tests {
                 u: Vector2::new(width, 0.0),
                 v: Vector2::new(0.0, height),
                 score: 0.95,
+                source: Source::Unet,
             })
             .collect()
     }

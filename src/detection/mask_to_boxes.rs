@@ -15,6 +15,7 @@
 //!
 //! A network of one channel has no cores: [`from_mask`] parts modules as the paper does, by erosion and dilation.
 
+use super::Source;
 use super::neighbours::Grid;
 use super::probability::ProbabilityMap;
 use crate::geometry::Quad;
@@ -35,6 +36,8 @@ const EROSION: u16 = 1;
 const PIXEL_VARIANCE: f64 = 1.0 / 12.0;
 /// Fewer pixels are a speck.
 const MIN_PIXELS: usize = 6;
+/// Half the side of a module after C^(-1/2): sqrt(12) / 2.
+const HALF: f64 = 1.732;
 /// A component of more than this many times the usual mass holds several modules.
 const MERGED: f64 = 1.7;
 /// The smallest part of the usual mass that is a module when a component falls apart.
@@ -58,12 +61,26 @@ pub struct ModuleBox {
     pub v: Vector2<f64>,
     /// 0 to 1.
     pub score: f32,
+    /// Which detector found it.
+    pub source: Source,
 }
 
 impl ModuleBox {
     /// The box as a quadrilateral.
     pub fn quad(&self) -> Quad {
         Quad::from_center(self.center, self.u / 2.0, self.v / 2.0)
+    }
+
+    /// The box on a raster whose pixels are `1 / pixel` as large along each axis: centres of pixels are at whole numbers in
+    /// both.
+    pub fn scaled(&self, pixel: Vector2<f64>) -> Self {
+        let half = Vector2::repeat(0.5);
+        Self {
+            center: (self.center + half).component_mul(&pixel) - half,
+            u: self.u.component_mul(&pixel),
+            v: self.v.component_mul(&pixel),
+            ..*self
+        }
     }
 
     /// Square pixels.
@@ -395,7 +412,7 @@ fn shapes(blobs: &[Blob], shrink: f64, usual: f64) -> Vec<ModuleBox> {
             let u = edges * Vector2::new(phi.cos(), phi.sin());
             let v = edges * Vector2::new(-phi.sin(), phi.cos());
             let (u, v) = if v.norm() > u.norm() { (v, -u) } else { (u, v) };
-            ModuleBox { center: blob.center, u, v, score: blob.score }
+            ModuleBox { center: blob.center, u, v, score: blob.score, source: Source::Unet }
         })
         .collect()
 }
@@ -419,6 +436,51 @@ pub fn from_mask(module: &ProbabilityMap) -> Vec<ModuleBox> {
             })
         },
     );
+    shapes(&blobs, 1.0, usual)
+}
+
+/// One module of an instance segmentation, measured on its own mask.
+pub(super) struct Instance(Blob);
+
+impl Instance {
+    /// Eroded and dilated, so that noise and thin bridges vanish (paper, 3.2); the largest component counts. `mask` has a
+    /// frame of one pixel of nought, and its first pixel stands at `offset`. `None` where nothing is left.
+    pub fn measure(mask: &ProbabilityMap, offset: Vector2<f64>, score: f32) -> Option<Self> {
+        let depth = depths(mask, ProbabilityMap::level(THRESHOLD));
+        let largest = |level: u16| -> Option<Blob> {
+            let components = Components::above(&depth, level);
+            let runs = components.iter().max_by_key(|runs| runs.iter().map(|run| run.x1 - run.x0).sum::<usize>())?;
+            Some(dilated(mask, &depth, runs, level))
+        };
+        // Modules of few pixels would be eroded to nothing.
+        let blob = largest(EROSION).or_else(|| largest(0))?;
+        Some(Self(Blob { center: blob.center + offset, score, is_cut: false, ..blob }))
+    }
+}
+
+/// The best instance of each place: one whose centre lies in a better one, or that holds a better one's centre, is the same
+/// module. Unlike overlaps of boxes along the pixel axes, this parts the neighbours of a turned lattice.
+pub(super) fn without_doubles(mut instances: Vec<Instance>) -> Vec<Instance> {
+    instances.sort_by(|a, b| b.0.score.total_cmp(&a.0.score));
+    let reach = instances.iter().map(|instance| instance.0.root.norm()).fold(0.0, f64::max) * HALF;
+    let grid = Grid::new(instances.iter().map(|instance| instance.0.center).collect(), reach);
+    let holds = |a: &Blob, b: &Blob| {
+        a.root.try_inverse().is_some_and(|inverse| (inverse * (b.center - a.center)).norm() < HALF)
+    };
+    let mut is_kept = vec![false; instances.len()];
+    for (index, Instance(blob)) in instances.iter().enumerate() {
+        is_kept[index] = !grid.within(blob.center, reach).any(|(other, _)| {
+            let better = &instances[other].0;
+            is_kept[other] && (holds(better, blob) || holds(blob, better))
+        });
+    }
+    instances.into_iter().zip(is_kept).filter(|(_, kept)| *kept).map(|(instance, _)| instance).collect()
+}
+
+/// Boxes of instances, each with the rotation and the moments that it shares with its neighbours.
+pub(super) fn from_instances(instances: &[Instance]) -> Vec<ModuleBox> {
+    let blobs: Vec<Blob> = instances.iter().map(|instance| instance.0).collect();
+    let usual = middle(blobs.iter().map(|blob| blob.mass));
     shapes(&blobs, 1.0, usual)
 }
 

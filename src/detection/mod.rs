@@ -1,17 +1,28 @@
 //! From an image to the modules in it (paper, 3.2).
 //!
 //! A semantic network ([`Unet`]) marks the pixels of modules; [`mask_to_boxes`] turns its masks into oriented boxes;
-//! [`filter`] drops what no module can be. An instance network may complement it behind the same [`Detector`].
+//! [`filter`] drops what no module can be. An instance network ([`Yolo`]) complements it, or stands alone, behind the same
+//! [`Detector`].
 
+mod detectors;
 pub mod external;
 pub mod filter;
+mod lattice;
 pub mod mask_to_boxes;
+mod merge;
 mod neighbours;
+mod open;
 pub mod probability;
 pub mod runtime;
+pub mod scale;
+mod tiles;
 mod unet;
+mod yolo;
 
+pub use open::open;
+pub use runtime::{ExecutionProvider, RuntimeSettings};
 pub use unet::Unet;
+pub use yolo::Yolo;
 
 use crate::geometry::Quad;
 use image::RgbImage;
@@ -71,6 +82,13 @@ pub enum DetectionError {
     RuntimeMissing,
     #[error("ONNX Runtime cannot be loaded from {library}: {what}; run `make setup`, or set ORT_DYLIB_PATH to another")]
     RuntimeUnusable { library: String, what: String },
+    #[error(
+        "this build of ONNX Runtime cannot run models on {provider} ({what}): choose --execution-provider cpu, or name a \
+         library that can with ORT_DYLIB_PATH"
+    )]
+    ProviderMissing { provider: &'static str, what: String },
+    #[error("{0}")]
+    ModelChoice(String),
     #[error("the model {name} cannot be read: {source}")]
     ModelUnreadable { name: String, source: std::io::Error },
     #[error("the model {name} is larger than the {limit} bytes that are read")]
@@ -93,6 +111,8 @@ impl DetectionError {
         match self {
             Self::RuntimeMissing => "onnx_runtime_missing",
             Self::RuntimeUnusable { .. } => "onnx_runtime_unusable",
+            Self::ProviderMissing { .. } => "execution_provider_missing",
+            Self::ModelChoice(_) => "model_choice",
             Self::ModelUnreadable { .. } => "model_unreadable",
             Self::ModelTooLarge { .. } => "model_too_large",
             Self::NotAModel { .. } => "model_invalid",

@@ -1,5 +1,7 @@
 //! Rasters of probabilities.
 
+use nalgebra::Vector2;
+
 /// Probabilities on a raster, in steps of 1/65535. Row by row; pixel centres at whole numbers.
 #[derive(Debug, Clone)]
 pub struct ProbabilityMap {
@@ -38,6 +40,22 @@ impl ProbabilityMap {
     /// The probability at a pixel, 0 to 1.
     pub fn get(&self, x: usize, y: usize) -> f32 {
         f32::from(self.values[y * self.width + x]) / Self::ONE
+    }
+
+    /// The probability between pixels, bilinear; the edge's beyond it, nought on an empty raster.
+    pub fn at(&self, place: Vector2<f64>) -> f64 {
+        if self.values.is_empty() {
+            return 0.0;
+        }
+        let split = |value: f64, length: usize| {
+            let value = value.clamp(0.0, (length - 1) as f64);
+            let below = (value as usize).min(length.saturating_sub(2));
+            (below, (below + 1).min(length - 1), value - below as f64)
+        };
+        let (x0, x1, fx) = split(place.x, self.width);
+        let (y0, y1, fy) = split(place.y, self.height);
+        let row = |y: usize| f64::from(self.get(x0, y)) * (1.0 - fx) + f64::from(self.get(x1, y)) * fx;
+        row(y0) * (1.0 - fy) + row(y1) * fy
     }
 
     /// A probability as it is stored: clamped to 0..1; what is no number becomes nought.

@@ -2,9 +2,10 @@
 
 use super::DetectionError;
 use ort::environment::Environment;
+use ort::ep;
 use ort::session::Session;
 use ort::session::builder::GraphOptimizationLevel;
-use ort::value::TensorElementType;
+use ort::value::{TensorElementType, TensorRef};
 use std::ffi::OsString;
 use std::fs::File;
 use std::io::Read;
@@ -14,8 +15,103 @@ use std::sync::{Condvar, Mutex, PoisonError};
 /// The largest model file that is read.
 pub const MAX_MODEL_BYTES: u64 = 512 << 20;
 
-/// The execution provider that runs the models.
-pub const EXECUTION_PROVIDER: &str = "CPU";
+/// What runs the models: ONNX Runtime's own CPU kernels, or one of the accelerators that a build of it may offer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum ExecutionProvider {
+    #[default]
+    Cpu,
+    Cuda,
+    Tensorrt,
+    Migraphx,
+    Openvino,
+    Xnnpack,
+    Coreml,
+    Directml,
+}
+
+impl ExecutionProvider {
+    /// All of them.
+    const ALL: [Self; 8] = [
+        Self::Cpu,
+        Self::Cuda,
+        Self::Tensorrt,
+        Self::Migraphx,
+        Self::Openvino,
+        Self::Xnnpack,
+        Self::Coreml,
+        Self::Directml,
+    ];
+
+    /// The name as people write it.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Cpu => "CPU",
+            Self::Cuda => "CUDA",
+            Self::Tensorrt => "TensorRT",
+            Self::Migraphx => "MIGraphX",
+            Self::Openvino => "OpenVINO",
+            Self::Xnnpack => "XNNPACK",
+            Self::Coreml => "CoreML",
+            Self::Directml => "DirectML",
+        }
+    }
+
+    /// What is registered before a session opens; nothing for the CPU, which ONNX Runtime always has.
+    fn dispatch(self) -> Option<ep::ExecutionProviderDispatch> {
+        Some(match self {
+            Self::Cpu => return None,
+            Self::Cuda => ep::CUDA::default().build(),
+            Self::Tensorrt => ep::TensorRT::default().build(),
+            Self::Migraphx => ep::MIGraphX::default().build(),
+            Self::Openvino => ep::OpenVINO::default().build(),
+            Self::Xnnpack => ep::XNNPACK::default().build(),
+            Self::Coreml => ep::CoreML::default().build(),
+            Self::Directml => ep::DirectML::default().build(),
+        })
+    }
+}
+
+impl std::str::FromStr for ExecutionProvider {
+    type Err = String;
+
+    /// By name, in any case.
+    fn from_str(text: &str) -> Result<Self, String> {
+        Self::ALL.into_iter().find(|provider| provider.as_str().eq_ignore_ascii_case(text)).ok_or_else(|| {
+            let names: Vec<String> = Self::ALL.iter().map(|provider| provider.as_str().to_ascii_lowercase()).collect();
+            format!("one of {} is expected", names.join(", "))
+        })
+    }
+}
+
+impl std::fmt::Display for ExecutionProvider {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(self.as_str())
+    }
+}
+
+/// How models are run.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct RuntimeSettings {
+    /// Threads; 0 is one per core.
+    pub threads: usize,
+    pub provider: ExecutionProvider,
+}
+
+impl RuntimeSettings {
+    /// On the CPU with so many threads.
+    pub fn with_threads(threads: usize) -> Self {
+        Self { threads, ..Self::default() }
+    }
+
+    pub(super) fn thread_count(self) -> usize {
+        if self.threads == 0 { std::thread::available_parallelism().map_or(1, usize::from) } else { self.threads }
+    }
+
+    /// For people: "CPU with 2 threads".
+    pub fn describe(self) -> String {
+        format!("ONNX Runtime on {} with {} threads", self.provider.as_str(), self.thread_count())
+    }
+}
 
 static ENVIRONMENT: Mutex<Option<Environment>> = Mutex::new(None);
 
@@ -123,35 +219,72 @@ impl Sessions {
     }
 }
 
-/// What a segmentation model of one image input and one mask output declares about itself.
-pub(super) struct SegmentationModel {
+/// An outlet of a model: its name, and its shape where it is a float32 tensor (negative where any size is taken).
+pub(super) struct Outlet {
+    pub name: String,
+    pub shape: Option<Vec<i64>>,
+}
+
+/// A model that takes photos, as far as its file tells: which kind it is, its outputs say.
+pub(super) struct ImageModel {
+    /// Name of the file.
+    pub name: String,
     pub sessions: Sessions,
+    pub settings: RuntimeSettings,
     pub input: String,
-    pub output: String,
     /// Height and width that the input is bound to, where it is.
     pub fixed_size: [Option<u32>; 2],
-    /// Metadata by key, without the prefix `heliomap.`.
+    pub outputs: Vec<Outlet>,
+    /// The outputs in words.
+    pub outputs_text: String,
+    /// Metadata by key.
     pub metadata: std::collections::BTreeMap<String, String>,
     /// SHA-256 of the file, hexadecimal.
     pub digest: String,
 }
 
-/// Reads a model file and opens it with `threads` threads, on one float32 input `[N, 3, H, W]` and one
-/// float32 output `[N, C, sH, sW]`.
+impl ImageModel {
+    /// The error that this model does not fit.
+    pub fn unfit(&self, what: impl Into<String>) -> DetectionError {
+        DetectionError::UnfitModel { name: self.name.clone(), what: what.into() }
+    }
+
+    /// Metadata of ours.
+    pub fn ours(&self, key: &str) -> Option<&str> {
+        self.metadata.get(&format!("heliomap.{key}")).map(|value| value.trim())
+    }
+
+    /// A positive number of our metadata.
+    pub fn number(&self, key: &str, text: &str) -> Result<f64, DetectionError> {
+        text.trim().parse().ok().filter(|value: &f64| value.is_finite() && *value > 0.0).ok_or_else(|| {
+            self.unfit(format!("its metadata `heliomap.{key}` is `{text}`; a positive number is needed"))
+        })
+    }
+
+    /// The version that the metadata tells, else the beginning of the file's digest.
+    pub fn version(&self) -> String {
+        self.ours("version").map_or_else(|| self.digest[..12].to_owned(), str::to_owned)
+    }
+}
+
+/// Reads a model file and opens it: a model of one float32 input `[N, 3, H, W]`.
 ///
 /// # Errors
-/// No runtime; a file that cannot be read, is too large, is no ONNX model or one of another shape.
-pub(super) fn open_segmentation(path: &Path, threads: usize) -> Result<SegmentationModel, DetectionError> {
+/// No runtime, or none with the execution provider that is asked for; a file that cannot be read, is too large, is no ONNX
+/// model or one with other inputs.
+pub(super) fn open_model(path: &Path, settings: RuntimeSettings) -> Result<ImageModel, DetectionError> {
     let name = path.file_name().map_or_else(|| path.display().to_string(), |name| name.to_string_lossy().into_owned());
     let bytes = read_bounded(path, &name)?;
     let no_model = |what: String| DetectionError::NotAModel { name: name.clone(), what };
     if bytes.is_empty() {
         return Err(no_model("the file is empty".to_owned()));
     }
-    let threads = threads.max(1);
-    let count = threads.min(MAX_SESSIONS);
-    let sessions: Vec<Session> =
-        (0..count).map(|_| open_session(&bytes, threads / count, &name)).collect::<Result<_, _>>()?;
+    let threads = settings.thread_count();
+    // An accelerator runs one tile after the other; sessions beside each other would only take its memory.
+    let count = if settings.provider == ExecutionProvider::Cpu { threads.min(MAX_SESSIONS) } else { 1 };
+    let sessions: Vec<Session> = (0..count)
+        .map(|_| open_session(&bytes, threads / count, settings.provider, &name))
+        .collect::<Result<_, _>>()?;
     let session = &sessions[0];
     let unfit = |what: String| DetectionError::UnfitModel { name: name.clone(), what };
     let shape_of = |outlet: &ort::value::Outlet| -> Option<Vec<i64>> {
@@ -182,32 +315,47 @@ pub(super) fn open_segmentation(path: &Path, threads: usize) -> Result<Segmentat
             dim => return Err(unfit(format!("its input is bound to {dim} pixels; 64 to 4096, or any, are needed"))),
         };
     }
-    let outputs = session.outputs();
-    let output = outputs
-        .iter()
-        .find(|outlet| outlet.name() == "masks")
-        .or(if let [only] = outputs { Some(only) } else { None })
-        .filter(|outlet| {
-            shape_of(outlet).is_some_and(|shape| {
-                shape.len() == 4 && fits(shape[0], 1) && (shape[1] < 0 || (1..=64).contains(&shape[1]))
-            })
-        })
-        .ok_or_else(|| {
-            unfit(format!("its output is {}; one of float32 [N, C, H, W] is needed, named `masks`", describe(outputs)))
-        })?;
     let metadata = {
         let held = session.metadata().map_err(|error| no_model(error.to_string()))?;
         let keys = held.custom_keys().map_err(|error| no_model(error.to_string()))?;
-        keys.iter().filter_map(|key| Some((key.strip_prefix("heliomap.")?.to_owned(), held.custom(key)?))).collect()
+        keys.iter().filter_map(|key| Some((key.clone(), held.custom(key)?))).collect()
     };
-    Ok(SegmentationModel {
+    let outputs = session.outputs();
+    Ok(ImageModel {
+        settings,
         input: input.name().to_owned(),
-        output: output.name().to_owned(),
+        outputs_text: describe(outputs),
+        outputs: outputs.iter().map(|o| Outlet { name: o.name().to_owned(), shape: shape_of(o) }).collect(),
         fixed_size,
         metadata,
         digest: hexadecimal(&<sha2::Sha256 as sha2::Digest>::digest(&bytes)),
         sessions: Sessions { idle: Mutex::new(sessions), returned: Condvar::new(), count },
+        name,
     })
+}
+
+/// Runs a session on one picture: planes of red, green and blue.
+pub(super) fn run<'s>(
+    session: &'s mut Session,
+    input: &str,
+    pixels: &[f32],
+    height: usize,
+    width: usize,
+) -> Result<ort::session::SessionOutputs<'s>, DetectionError> {
+    let failed = |error: ort::Error| DetectionError::Inference { what: error.message().to_owned() };
+    let tensor = TensorRef::from_array_view(([1, 3, height, width], pixels)).map_err(failed)?;
+    session.run(ort::inputs![input => tensor]).map_err(failed)
+}
+
+/// The shape and the values of an output.
+pub(super) fn extract<'o>(
+    outputs: &'o ort::session::SessionOutputs<'_>,
+    name: &str,
+) -> Result<(Vec<usize>, &'o [f32]), DetectionError> {
+    let failed = |what: String| DetectionError::Inference { what };
+    let value = outputs.get(name).ok_or_else(|| failed(format!("it gave no output `{name}`")))?;
+    let (shape, values) = value.try_extract_tensor::<f32>().map_err(|error| failed(error.message().to_owned()))?;
+    Ok((shape.iter().map(|dim| usize::try_from(*dim).unwrap_or(0)).collect(), values))
 }
 
 fn hexadecimal(bytes: &[u8]) -> String {
@@ -229,7 +377,12 @@ fn read_bounded(path: &Path, name: &str) -> Result<Vec<u8>, DetectionError> {
     Ok(bytes)
 }
 
-fn open_session(bytes: &[u8], threads: usize, name: &str) -> Result<Session, DetectionError> {
+fn open_session(
+    bytes: &[u8],
+    threads: usize,
+    provider: ExecutionProvider,
+    name: &str,
+) -> Result<Session, DetectionError> {
     let environment = environment()?;
     let no_model = |what: &str| DetectionError::NotAModel { name: name.to_owned(), what: first_line(what) };
     let options = || -> ort::Result<_> {
@@ -240,12 +393,13 @@ fn open_session(bytes: &[u8], threads: usize, name: &str) -> Result<Session, Det
             .with_intra_op_spinning(false)?)
     };
     let mut builder = options().map_err(|error| DetectionError::Inference { what: error.message().to_owned() })?;
+    if let Some(dispatch) = provider.dispatch() {
+        dispatch.register(&mut builder).map_err(|error| DetectionError::ProviderMissing {
+            provider: provider.as_str(),
+            what: first_line(error.message()),
+        })?;
+    }
     builder.commit_from_memory(bytes).map_err(|error| no_model(error.message()))
-}
-
-/// Cores that this process may use.
-pub(super) fn available_threads() -> usize {
-    std::thread::available_parallelism().map_or(1, std::num::NonZero::get)
 }
 
 /// The first line of a message, of bounded length.

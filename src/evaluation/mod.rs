@@ -2,6 +2,7 @@
 //! its place in the structure, and how far it lies off.
 
 mod align;
+pub mod detection;
 mod model;
 mod plots;
 mod read;

@@ -59,6 +59,13 @@ impl Quad {
         (a.min(b), a.max(b))
     }
 
+    /// Whether it turns the same way at every corner.
+    pub fn is_convex(&self) -> bool {
+        let c = &self.corners;
+        let turns = [0, 1, 2, 3].map(|k| (c[(k + 1) % 4] - c[k]).perp(&(c[(k + 2) % 4] - c[(k + 1) % 4])));
+        turns.iter().all(|turn| *turn > 0.0) || turns.iter().all(|turn| *turn < 0.0)
+    }
+
     /// Whether the point lies inside or on the border.
     pub fn contains(&self, point: Vector2<f64>) -> bool {
         let mut positive = false;

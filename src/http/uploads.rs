@@ -92,7 +92,9 @@ pub async fn put_image(
 ///
 /// `path` is its place in OpenSfM's folder: `reconstruction.json`, `reference_lla.json`, `camera_models.json`,
 /// `undistorted/reconstruction.json`, `undistorted/undistorted_shot_ids.json`, `undistorted/images/NAME`,
-/// `undistorted/depthmaps/merged.ply`.
+/// `undistorted/depthmaps/merged.ply`. Beside these, `boxes.json`: boxes that another program made or a person corrected, in
+/// the form that `heliomap detect` writes (pixels of the undistorted images, corners in any order); the survey is then mapped
+/// from them, and no detector runs.
 #[utoipa::path(
     put,
     path = "/api/v1/plants/{plant}/surveys/{survey}/reconstruction/{*path}",

@@ -22,6 +22,9 @@ pub trait Mapper: Send + Sync + 'static {
     fn identity(&self) -> Result<String, MapError>;
 }
 
+/// The file of a survey whose boxes stand in the place of a detector.
+const BOXES_FILE: &str = "boxes.json";
+
 /// Opens a detector.
 pub type OpenDetector = dyn Fn() -> Result<Arc<dyn Detector>, DetectionError> + Send + Sync;
 
@@ -57,9 +60,14 @@ impl Mapper for PipelineMapper {
         subject: &Subject,
         observer: &dyn Observer,
     ) -> Result<PlantModel, MapError> {
-        let detector = self.detector()?;
-        let mapping = pipeline::map_folder(folder, Boxes::Detector(&*detector), options, subject, observer)
-            .map_err(|error| as_in_the_survey(error, folder))?;
+        let boxes = folder.join(BOXES_FILE);
+        let mapping = if boxes.is_file() {
+            pipeline::map_folder(folder, Boxes::File(&boxes), options, subject, observer)
+        } else {
+            let detector = self.detector()?;
+            pipeline::map_folder(folder, Boxes::Detector(&*detector), options, subject, observer)
+        };
+        let mapping = mapping.map_err(|error| as_in_the_survey(error, folder))?;
         for timing in &mapping.timings {
             tracing::debug!(stage = timing.stage.as_str(), seconds = timing.wall.as_secs_f64(), "stage finished");
         }

@@ -10,7 +10,8 @@ const MAX_NAME_BYTES: usize = 200;
 const IMAGE_ENDINGS: [&str; 5] = ["jpg", "jpeg", "png", "tif", "tiff"];
 
 /// The reconstruction's files that are no images.
-const RECONSTRUCTION_FILES: [&str; 6] = [
+const RECONSTRUCTION_FILES: [&str; 7] = [
+    "boxes.json",
     "reconstruction.json",
     "reference_lla.json",
     "camera_models.json",
@@ -27,7 +28,7 @@ pub enum InvalidPath {
     Name { name: String, reason: &'static str },
     /// A path that no reader looks at.
     #[error(
-        "`{path}` is no file of a reconstruction: expected are reconstruction.json, reference_lla.json, \
+        "`{path}` is no file of a reconstruction: expected are boxes.json, reconstruction.json, reference_lla.json, \
          camera_models.json, undistorted/reconstruction.json, undistorted/undistorted_shot_ids.json, \
          undistorted/images/NAME and undistorted/depthmaps/merged.ply"
     )]

@@ -272,3 +272,39 @@ async fn a_plant_without_a_single_gap_is_mapped() {
     let model = succeeds(&app, &Files::new(), &[]).await;
     assert_eq!(features(&model, "benches"), 1, "{model}");
 }
+
+/// A detector that must not be asked.
+struct Refusing;
+
+impl Detector for Refusing {
+    fn detect(&self, _: &RgbImage, _: Option<f64>) -> Result<Vec<Detection>, DetectionError> {
+        Err(DetectionError::Inference { what: "the detector was asked".to_owned() })
+    }
+
+    fn describe(&self) -> String {
+        "refuses".to_owned()
+    }
+}
+
+#[tokio::test]
+async fn boxes_that_come_with_a_survey_stand_in_the_place_of_a_detector() {
+    let app = App::with_detector(Arc::new(Refusing)).await;
+    let boxes = true_boxes(|_| true);
+    let files = Files::new().with("boxes.json", boxes.to_string());
+    let model = succeeds(&app, &files, &["no_dense_cloud"]).await;
+    assert!(features(&model, "modules") > 400, "{model}");
+
+    let mut other_size = boxes.clone();
+    other_size["images"][0]["width"] = json!(4000);
+    let files = Files::new().with("boxes.json", other_size.to_string());
+    fails(&app, &files, "boxes_invalid", &["4000 x 912 pixels", "1368 x 912", "give boxes in pixels of that image"])
+        .await;
+
+    let mut flat = boxes.clone();
+    flat["images"][1]["boxes"][3]["corners"] = json!([[1, 1], [2, 2], [3, 3], [4, 4]]);
+    let files = Files::new().with("boxes.json", flat.to_string());
+    fails(&app, &files, "boxes_invalid", &["boxes.json: box 3 of DJI_0002.jpg", "no convex quadrilateral"]).await;
+
+    let files = Files::new().with("boxes.json", "{\"images\": 7}");
+    fails(&app, &files, "boxes_invalid", &["boxes.json is not a file of boxes"]).await;
+}

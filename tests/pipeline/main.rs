@@ -4,6 +4,7 @@
 mod boxes;
 mod broken;
 mod data;
+mod detect;
 mod survey;
 mod unusual;
 mod whole;

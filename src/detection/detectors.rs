@@ -1,0 +1,55 @@
+//! What is made of the networks' boxes: one set of modules per image.
+
+use super::mask_to_boxes::ModuleBox;
+use super::merge::merge;
+use super::{Detection, DetectionError, Detector, Unet, Yolo, filter, lattice};
+use crate::geometry::Quad;
+use image::RgbImage;
+use nalgebra::Vector2;
+
+/// Both detectors, the one complementing the other (paper, 3.2).
+pub(super) struct Both {
+    pub unet: Unet,
+    pub yolo: Yolo,
+}
+
+impl Detector for Both {
+    fn detect(&self, image: &RgbImage, gsd_m: Option<f64>) -> Result<Vec<Detection>, DetectionError> {
+        detect(Some(&self.unet), Some(&self.yolo), image, gsd_m)
+    }
+
+    fn describe(&self) -> String {
+        format!("{}; complemented by {}", self.unet.describe(), self.yolo.describe())
+    }
+}
+
+/// Searches an image with the networks that are there. Modules wholly inside it, in its pixels.
+pub(super) fn detect(
+    unet: Option<&Unet>,
+    yolo: Option<&Yolo>,
+    image: &RgbImage,
+    gsd_m: Option<f64>,
+) -> Result<Vec<Detection>, DetectionError> {
+    let (width, height) = image.dimensions();
+    if width == 0 || height == 0 {
+        return Ok(Vec::new());
+    }
+    let (foundation, seen) = match unet {
+        Some(unet) => {
+            let (boxes, seen) = unet.search(image, gsd_m)?;
+            (boxes, Some(seen))
+        }
+        None => (Vec::new(), None),
+    };
+    let complement = yolo.map(|yolo| yolo.search(image, gsd_m)).transpose()?.unwrap_or_default();
+    let boxes = merge(foundation, complement);
+    let evidence = seen.as_ref().map(|seen| seen as &dyn lattice::Evidence);
+    let size = Vector2::new(f64::from(width), f64::from(height));
+    let boxes = filter::supported(lattice::complete(boxes, evidence, size));
+    Ok(boxes.iter().filter_map(detection).filter(|d| filter::is_inside_frame(&d.quad.corners, width, height)).collect())
+}
+
+fn detection(b: &ModuleBox) -> Option<Detection> {
+    let quad = Quad::from_unordered(b.quad().corners)?;
+    Some(Detection { quad, score: b.score, source: b.source })
+}
