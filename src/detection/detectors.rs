@@ -7,6 +7,9 @@ use crate::geometry::Quad;
 use image::RgbImage;
 use nalgebra::Vector2;
 
+/// Least mean probability of a face by the U-Net where YOLO alone has a box: on shadows and trees there is little.
+const TRACE: f64 = 0.5;
+
 /// Both detectors, the one complementing the other (paper, 3.2).
 pub(super) struct Both {
     pub unet: Unet,
@@ -42,10 +45,13 @@ pub(super) fn detect(
         None => (Vec::new(), None),
     };
     let complement = yolo.map(|yolo| yolo.search(image, gsd_m)).transpose()?.unwrap_or_default();
-    let boxes = merge(foundation, complement);
     let evidence = seen.as_ref().map(|seen| seen as &dyn lattice::Evidence);
     let size = Vector2::new(f64::from(width), f64::from(height));
-    let boxes = filter::supported(lattice::complete(boxes, evidence, size));
+    // Each network's boxes in their own lattices first: the less exact must not disturb the more exact.
+    let foundation = lattice::complete(foundation, evidence, size);
+    let complement = lattice::complete(complement, None, size);
+    let shows = |b: &ModuleBox| evidence.is_none_or(|evidence| lattice::face(b, evidence) > TRACE);
+    let boxes = filter::supported(merge(foundation, complement, shows));
     Ok(boxes.iter().filter_map(detection).filter(|d| filter::is_inside_frame(&d.quad.corners, width, height)).collect())
 }
 

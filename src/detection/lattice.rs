@@ -518,17 +518,8 @@ fn shown(candidate: &ModuleBox, evidence: &dyn Evidence, size: Vector2<f64>, lea
     if !is_inside(&quad, size) {
         return None;
     }
-    // The mean over the face, and over each of its four sides: a box half on bare ground has none on one side.
-    let mean = |from: Vector2<f64>, to: Vector2<f64>| {
-        let mut sum = 0.0;
-        for i in 0..5 {
-            for j in 0..5 {
-                let at = from + (to - from).component_mul(&Vector2::new(f64::from(i), f64::from(j))) / 4.0;
-                sum += evidence.module(candidate.center + candidate.u * at.x + candidate.v * at.y);
-            }
-        }
-        sum / 25.0
-    };
+    // Over each of the four sides, too: a box half on bare ground has none on one side.
+    let mean = |from: Vector2<f64>, to: Vector2<f64>| mean_within(candidate, evidence, from, to);
     let (low, high) = (Vector2::repeat(-0.42), Vector2::repeat(0.42));
     let sides = [
         mean(low, Vector2::new(-0.25, 0.42)),
@@ -539,6 +530,23 @@ fn shown(candidate: &ModuleBox, evidence: &dyn Evidence, size: Vector2<f64>, lea
     let module = mean(low, high);
     let is_whole = sides.iter().all(|side| *side > SIDE * least);
     (module > least && is_whole).then_some(module as f32)
+}
+
+/// Mean probability of a face within a box.
+pub(super) fn face(b: &ModuleBox, evidence: &dyn Evidence) -> f64 {
+    mean_within(b, evidence, Vector2::repeat(-0.42), Vector2::repeat(0.42))
+}
+
+/// Mean probability of a face in a part of a box, whose corners are given in parts of its edges from its centre.
+fn mean_within(b: &ModuleBox, evidence: &dyn Evidence, from: Vector2<f64>, to: Vector2<f64>) -> f64 {
+    let mut sum = 0.0;
+    for i in 0..5 {
+        for j in 0..5 {
+            let at = from + (to - from).component_mul(&Vector2::new(f64::from(i), f64::from(j))) / 4.0;
+            sum += evidence.module(b.center + b.u * at.x + b.v * at.y);
+        }
+    }
+    sum / 25.0
 }
 
 fn is_inside(quad: &Quad, size: Vector2<f64>) -> bool {

@@ -12,10 +12,16 @@ const APART: f64 = 0.6;
 /// How many modules beyond the foundation's boxes its lattice may be continued.
 const CONTINUED: usize = 3;
 
-/// The boxes of the foundation, and those of the complement that find something else. Where there is no foundation, the
-/// complement's own representative box sets the size.
-pub fn merge(foundation: Vec<ModuleBox>, complement: Vec<ModuleBox>) -> Vec<ModuleBox> {
-    let measure = if foundation.is_empty() { &complement } else { &foundation };
+/// The boxes of the foundation, and those of the complement that find something else and of which the foundation's network
+/// `shows` at least a trace. Complements take the shape of the neighbour whose lattice they continue. Where there is no
+/// foundation, the complement's own representative box sets the size.
+pub fn merge(
+    foundation: Vec<ModuleBox>,
+    complement: Vec<ModuleBox>,
+    shows: impl Fn(&ModuleBox) -> bool,
+) -> Vec<ModuleBox> {
+    let found_alone = foundation.is_empty();
+    let measure = if found_alone { &complement } else { &foundation };
     let representative = middle(measure.iter().map(ModuleBox::area_px2));
     let longest = foundation.iter().chain(&complement).map(|b| b.u.norm()).fold(0.0, f64::max);
     let grid = Grid::new(foundation.iter().map(|b| b.center).collect(), longest);
@@ -28,20 +34,22 @@ pub fn merge(foundation: Vec<ModuleBox>, complement: Vec<ModuleBox>) -> Vec<Modu
                     && quad.overlap_px2(&other.quad()) < OVERLAP * b.area_px2().min(other.area_px2())
             })
     };
-    let added: Vec<ModuleBox> = complement.into_iter().filter(is_new).collect();
-    let (count, found_alone) = (foundation.len(), foundation.is_empty());
-    let all: Vec<ModuleBox> = foundation.into_iter().chain(added).collect();
+    let added: Vec<ModuleBox> = complement.into_iter().filter(|b| is_new(b) && (found_alone || shows(b))).collect();
+    let count = foundation.len();
+    let mut all: Vec<ModuleBox> = foundation.into_iter().chain(added).collect();
     if found_alone {
         return all;
     }
     let neighbours = lattice_neighbours(&all);
     let mut is_kept: Vec<bool> = (0..all.len()).map(|index| index < count).collect();
     for _ in 0..CONTINUED {
-        let reached: Vec<usize> = (count..all.len())
-            .filter(|&index| !is_kept[index] && neighbours[index].iter().any(|&other| is_kept[other]))
+        let reached: Vec<(usize, usize)> = (count..all.len())
+            .filter(|&index| !is_kept[index])
+            .filter_map(|index| Some((index, neighbours[index].iter().copied().find(|&other| is_kept[other])?)))
             .collect();
-        for index in reached {
+        for (index, like) in reached {
             is_kept[index] = true;
+            all[index] = ModuleBox { u: all[like].u, v: all[like].v, ..all[index] };
         }
     }
     all.into_iter().zip(is_kept).filter(|(_, kept)| *kept).map(|(b, _)| b).collect()
@@ -72,16 +80,18 @@ mod tests {
             at(150.0, 2.0, Source::Yolo),
             at(200.0, 0.5, Source::Yolo),
         ];
-        let merged = merge(foundation, complement);
+        let merged = merge(foundation.clone(), complement.clone(), |_| true);
         let new: Vec<f64> = merged.iter().filter(|b| b.source == Source::Yolo).map(|b| b.center.x).collect();
         assert_eq!((merged.len(), new), (4, vec![61.0]));
+        // Of which the foundation's own network shows nothing.
+        assert_eq!(merge(foundation, complement, |_| false).len(), 3);
     }
 
     #[test]
     fn either_alone_stands() {
         let complement = [at(20.0, 1.0, Source::Yolo), at(40.5, 1.0, Source::Yolo)];
-        assert_eq!(merge(Vec::new(), complement.to_vec()).len(), 2);
-        assert_eq!(merge(complement.to_vec(), Vec::new()).len(), 2);
-        assert!(merge(Vec::new(), Vec::new()).is_empty());
+        assert_eq!(merge(Vec::new(), complement.to_vec(), |_| false).len(), 2);
+        assert_eq!(merge(complement.to_vec(), Vec::new(), |_| true).len(), 2);
+        assert!(merge(Vec::new(), Vec::new(), |_| true).is_empty());
     }
 }
