@@ -42,7 +42,7 @@ KINDS = {
 def arguments() -> argparse.Namespace:
     p = argparse.ArgumentParser(description=__doc__)
     p.add_argument("--kind", choices=KINDS, default="joint")
-    p.add_argument("--out", type=Path, default=Path("runs/unet"), help="folder of checkpoints and the log")
+    p.add_argument("--out", type=Path, default=Path("runs/both"), help="folder of checkpoints and the log")
     p.add_argument("--steps", type=int, default=5000, help="length of the learning-rate schedule")
     p.add_argument(
         "--minutes", type=float, default=0, help="end the schedule after so many minutes, if the steps do not end it first"
