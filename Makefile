@@ -17,7 +17,7 @@ export ORT_DYLIB_PATH ?= $(abspath $(ORT_LIBRARY))
 HELIOMAP_DATA ?= $(wildcard ../shared/data)
 export HELIOMAP_DATA
 
-.PHONY: help setup web demo test lint unit kills structure bench yolo-export openapi clean
+.PHONY: help setup web demo test lint unit kills structure bench scaling yolo-export openapi clean
 
 help: ## List the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -60,7 +60,10 @@ structure: setup ## Survey of every kind of simulated layout: how many come out 
 	$(CARGO) test --locked --test structure -- --ignored --nocapture
 
 bench: setup ## Benchmarks of layout, locate, fusion and refinement
-	$(CARGO) bench --locked
+	$(CARGO) bench --locked --bench structure
+
+scaling: setup ## Time and memory over the size of the plant, to a million modules, with a plot in target/scaling
+	$(CARGO) bench --locked --bench scaling
 
 # Of its own, because the package and PyTorch are large. Its licence is AGPL: nothing of it is kept.
 ULTRALYTICS_VERSION := 8.4.190

@@ -8,7 +8,7 @@ use crate::layout::{self, Layout, LayoutOptions};
 use crate::plant::assemble::{Identity, assemble};
 use crate::plant::{PlantId, PlantModel, Warning};
 use crate::reconstruction::{self, Photo, PhotoError, Project, ReadError, Shot};
-use crate::refinement::{self, RefinedBench, RefinementOptions};
+use crate::refinement::{self, Control, ControlError, Refined, RefinementOptions};
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
@@ -70,6 +70,14 @@ pub struct MapOptions {
     pub max_gsd_m_per_px: Option<f64>,
     /// Known spacing of module centres along and across the row, metres (last paragraph of 4.3.1): fixes the scale.
     pub spacing_m: Option<[f64; 2]>,
+    /// Known width (along the row) and height (across it) of a module's face, metres: fixes the scale likewise.
+    pub module_size_m: Option<[f64; 2]>,
+    /// Places that are known, to align the model by.
+    pub control: Option<Control>,
+    /// Whether known places set the scale too; where it is not given, they do unless a spacing or module size does.
+    pub control_scale: Option<bool>,
+    /// What heights refer to, where the user knows it.
+    pub vertical_datum: Option<String>,
     /// How positions are refined.
     pub refinement: refinement::Method,
     /// Most pixels that an image may have.
@@ -84,6 +92,10 @@ impl Default for MapOptions {
             rows_per_bench: None,
             max_gsd_m_per_px: None,
             spacing_m: None,
+            module_size_m: None,
+            control: None,
+            control_scale: None,
+            vertical_datum: None,
             refinement: refinement::Method::default(),
             max_image_pixels: reconstruction::photo::DEFAULT_MAX_PIXELS,
             seed: 1,
@@ -105,6 +117,18 @@ impl MapOptions {
         }
         if self.spacing_m.is_some_and(|spacing| spacing.iter().any(|s| !(0.1..=10.0).contains(s))) {
             return refuse("spacing_m must be two lengths of 0.1 to 10 metres, along and across the row");
+        }
+        if self.module_size_m.is_some_and(|size| size.iter().any(|s| !(0.1..=10.0).contains(s))) {
+            return refuse("module_size_m must be two lengths of 0.1 to 10 metres, width along the row and height");
+        }
+        if self.spacing_m.is_some() && self.module_size_m.is_some() {
+            return refuse("spacing_m and module_size_m both fix the scale: give one of them");
+        }
+        if self.vertical_datum.as_ref().is_some_and(|datum| datum.is_empty() || datum.len() > 200) {
+            return refuse("vertical_datum must be a name of 1 to 200 bytes");
+        }
+        if let Some(control) = &self.control {
+            control.check()?;
         }
         Ok(())
     }
@@ -172,7 +196,7 @@ pub struct Mapping {
     pub detections: Vec<ImageDetections>,
     pub layouts: Vec<Layout>,
     pub fused: Fused,
-    pub refined: Vec<RefinedBench>,
+    pub refined: Refined,
 }
 
 /// Why a mapping could not be made.
@@ -191,6 +215,12 @@ pub enum MapError {
 impl From<ReadError> for MapError {
     fn from(error: ReadError) -> Self {
         Self::Input { code: error.code(), message: error.to_string() }
+    }
+}
+
+impl From<ControlError> for MapError {
+    fn from(error: ControlError) -> Self {
+        Self::Input { code: "control_invalid", message: error.to_string() }
     }
 }
 
@@ -302,9 +332,22 @@ pub fn map_folder(
             ),
         });
     }
-    let refinement_options =
-        RefinementOptions { method: options.refinement, spacing_m: options.spacing_m, seed: options.seed };
-    let refined = clock.stage(Stage::Refine, || refinement::refine(&views, &fused, &refinement_options))?;
+    let refinement_options = RefinementOptions {
+        method: options.refinement,
+        spacing_m: options.spacing_m,
+        module_size_m: options.module_size_m,
+        seed: options.seed,
+    };
+    let reference = project.reconstruction.reference;
+    let refined = clock.stage(Stage::Refine, || -> Result<Refined, MapError> {
+        let mut refined = refinement::refine(&views, &fused, &refinement_options);
+        if let Some(control) = &options.control {
+            let scale_known = options.spacing_m.is_some() || options.module_size_m.is_some();
+            let with_scale = options.control_scale.unwrap_or(!scale_known);
+            refinement::alignment::align(&views, &fused, &mut refined, reference, control, with_scale)?;
+        }
+        Ok(refined)
+    })??;
     let identity = Identity {
         plant: subject.plant,
         plant_name: &subject.plant_name,
@@ -312,7 +355,7 @@ pub fn map_folder(
         previous: subject.previous.as_deref(),
     };
     let model = clock.stage(Stage::Assemble, || {
-        assemble(&views, &fused, &refined, project.reconstruction.reference, vertical_datum(), &identity, warnings)
+        assemble(&views, &fused, &refined, reference, vertical_datum(options), &identity, warnings)
     })?;
     let timings = clock.timings;
     Ok(Mapping { model, timings, photos, shots, detections, layouts, fused, refined })
@@ -591,10 +634,17 @@ fn read_boxes(
     })?
 }
 
-fn vertical_datum() -> String {
-    "as the image positions that the reconstruction was aligned to (for drones usually height above the WGS84 ellipsoid or \
+/// What heights refer to: as the user says, else as the control does, else what is known of drones.
+fn vertical_datum(options: &MapOptions) -> String {
+    let of_control = || options.control.as_ref().and_then(|control| control.vertical_datum.clone());
+    options.vertical_datum.clone().or_else(of_control).unwrap_or_else(|| {
+        if options.control.is_some() {
+            return "as the control that the model was aligned to".to_owned();
+        }
+        "as the image positions that the reconstruction was aligned to (for drones usually height above the WGS84 ellipsoid or \
      a barometric height; not checked)"
-        .to_owned()
+            .to_owned()
+    })
 }
 
 /// Highest resident memory of this process so far, bytes, where `/proc` tells it.

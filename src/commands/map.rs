@@ -6,7 +6,7 @@ use heliomap::config::DetectorArgs;
 use heliomap::overlay;
 use heliomap::pipeline::{self, Boxes, MapOptions, Observer, Stage, Subject};
 use heliomap::plant::{Layer, PlantId, PlantModel};
-use heliomap::refinement::Method;
+use heliomap::refinement::{Control, Method};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde_json::{Value, json};
 use std::io::IsTerminal;
@@ -56,6 +56,19 @@ pub struct MapArgs {
     /// Known spacing of module centres along and across the row in metres, for example 1.02,1.67: fixes the scale
     #[arg(long, value_name = "ALONG,ACROSS", value_delimiter = ',')]
     spacing: Option<Vec<f64>>,
+    /// Known size of a module's face in metres, width along the row and height across it, for example 1.00,1.65: fixes
+    /// the scale
+    #[arg(long, value_name = "WIDTH,HEIGHT", value_delimiter = ',', conflicts_with = "spacing")]
+    module_size: Option<Vec<f64>>,
+    /// Control points and known modules to align the model by, a JSON file (docs/PIPELINE.md tells its form)
+    #[arg(long, value_name = "FILE")]
+    control: Option<PathBuf>,
+    /// Whether control sets the scale too [default: unless --spacing or --module-size does]
+    #[arg(long, value_name = "BOOL", requires = "control")]
+    control_scale: Option<bool>,
+    /// What heights refer to, stated in the model, for example "EGM2008 height"
+    #[arg(long, value_name = "NAME")]
+    vertical_datum: Option<String>,
     /// How positions are refined
     #[arg(long, value_enum, default_value_t = MethodArg::Lattice)]
     refinement: MethodArg,
@@ -86,15 +99,18 @@ pub fn run(args: &MapArgs) -> anyhow::Result<()> {
     let cores = std::thread::available_parallelism().map_or(2, usize::from);
     let threads = args.threads.unwrap_or(cores).max(1);
     rayon::ThreadPoolBuilder::new().num_threads(threads).build_global().context("starting the threads")?;
-    let spacing_m = match args.spacing.as_deref() {
-        None => None,
-        Some(&[along, across]) => Some([along, across]),
-        Some(_) => bail!("--spacing takes two lengths in metres, along and across the row"),
-    };
+    let spacing_m =
+        two_lengths(args.spacing.as_deref(), "--spacing takes two lengths in metres, along and across the row")?;
+    let module_size_m =
+        two_lengths(args.module_size.as_deref(), "--module-size takes two lengths in metres, width and height")?;
     let options = MapOptions {
         rows_per_bench: args.rows_per_bench,
         max_gsd_m_per_px: args.max_gsd,
         spacing_m,
+        module_size_m,
+        control: args.control.as_deref().map(read_control).transpose()?,
+        control_scale: args.control_scale,
+        vertical_datum: args.vertical_datum.clone(),
         refinement: match args.refinement {
             MethodArg::Lattice => Method::Lattice,
             MethodArg::Paper => Method::Paper,
@@ -183,6 +199,25 @@ pub fn write_json(path: &Path, value: &Value) -> anyhow::Result<()> {
     file.as_file().set_permissions(readable).with_context(what)?;
     file.persist(path).with_context(what)?;
     Ok(())
+}
+
+fn two_lengths(given: Option<&[f64]>, expected: &'static str) -> anyhow::Result<Option<[f64; 2]>> {
+    match given {
+        None => Ok(None),
+        Some(&[first, second]) => Ok(Some([first, second])),
+        Some(_) => bail!(expected),
+    }
+}
+
+fn read_control(path: &Path) -> anyhow::Result<Control> {
+    const MOST_BYTES: u64 = 64 << 20;
+    let what = || format!("reading {}", path.display());
+    let file = std::fs::File::open(path).with_context(what)?;
+    if file.metadata().with_context(what)?.len() > MOST_BYTES {
+        bail!("{} is larger than {MOST_BYTES} bytes, more than control points need", path.display());
+    }
+    serde_json::from_reader(std::io::BufReader::new(file))
+        .with_context(|| format!("{} is no file of control points as docs/PIPELINE.md describes it", path.display()))
 }
 
 fn read_model(path: &Path) -> anyhow::Result<PlantModel> {

@@ -1,12 +1,89 @@
 //! A point cloud with normals, and the index that finds the points near a ray.
 
 use nalgebra::Vector3;
+use std::collections::HashSet;
+use std::hash::{BuildHasherDefault, Hasher};
 
 /// Points and their normals in the local frame, metres. `normals` is empty or as long as `positions_m`.
 #[derive(Debug, Clone, Default)]
 pub struct PointCloud {
     pub positions_m: Vec<[f32; 3]>,
     pub normals: Vec<[f32; 3]>,
+}
+
+/// Gathers points one by one and thins them as they come, so that memory stays bounded whatever their number: once there
+/// are more than `most`, only the first point of each cube of a regular grid is kept, the cubes as small as the bound
+/// allows. The same points in the same order give the same cloud.
+#[derive(Debug)]
+pub struct ThinningCloud {
+    most: usize,
+    /// Edge of the cubes; `None` while every point is kept.
+    cube_m: Option<f64>,
+    taken: HashSet<u64, BuildHasherDefault<CubeHasher>>,
+    positions_m: Vec<[f32; 3]>,
+}
+
+impl ThinningCloud {
+    /// Smallest cubes, metres: finer than any dense cloud.
+    const FIRST_CUBE_M: f64 = 0.02;
+
+    /// An empty cloud that will hold `most` points at most (at least one), with room for `expected` of them.
+    pub fn new(most: usize, expected: usize) -> Self {
+        let most = most.max(1);
+        Self { most, cube_m: None, taken: HashSet::default(), positions_m: Vec::with_capacity(expected.min(most)) }
+    }
+
+    /// Takes a point in, metres.
+    pub fn push(&mut self, position_m: [f32; 3]) {
+        if self.cube_m.is_some_and(|cube_m| !self.taken.insert(cube(position_m, cube_m))) {
+            return;
+        }
+        while self.positions_m.len() >= self.most {
+            let cube_m = self.cube_m.map_or(Self::FIRST_CUBE_M, |cube_m| cube_m * 1.25);
+            self.cube_m = Some(cube_m);
+            let taken = &mut self.taken;
+            taken.clear();
+            self.positions_m.retain(|kept| taken.insert(cube(*kept, cube_m)));
+            if !self.taken.insert(cube(position_m, cube_m)) {
+                return;
+            }
+        }
+        self.positions_m.push(position_m);
+    }
+
+    /// The cloud, and the edge of the cubes that it was thinned to, metres, if it was.
+    pub fn finish(self) -> (PointCloud, Option<f64>) {
+        (PointCloud { positions_m: self.positions_m, normals: Vec::new() }, self.cube_m)
+    }
+}
+
+/// Number of the cube that a point lies in: 21 bits a coordinate, so that cubes of 2 cm repeat after 42 km.
+fn cube(position_m: [f32; 3], cube_m: f64) -> u64 {
+    position_m.iter().fold(0, |key, coordinate| {
+        let index = (f64::from(*coordinate) / cube_m).floor() as i64;
+        key << 21 | (index as u64 & 0x1F_FFFF)
+    })
+}
+
+/// Cube numbers are spread by a multiplication: a keyed hash would cost more than all the rest.
+#[derive(Debug, Default, Clone, Copy)]
+struct CubeHasher(u64);
+
+impl Hasher for CubeHasher {
+    fn finish(&self) -> u64 {
+        self.0
+    }
+
+    fn write(&mut self, bytes: &[u8]) {
+        for byte in bytes {
+            self.write_u64(u64::from(*byte));
+        }
+    }
+
+    fn write_u64(&mut self, value: u64) {
+        let mixed = (self.0 ^ value).wrapping_mul(0x9E37_79B9_7F4A_7C15);
+        self.0 = mixed ^ (mixed >> 29);
+    }
 }
 
 /// A point near a ray.
@@ -181,6 +258,35 @@ impl<'a> CloudIndex<'a> {
 mod tests {
     use super::*;
     use proptest::prelude::*;
+
+    #[test]
+    fn a_cloud_is_thinned_evenly_and_never_holds_more_than_it_may() {
+        let mut thinning = ThinningCloud::new(5_000, 40_000);
+        // 20 m by 20 m in steps of 10 cm, in an order that jumps about.
+        for k in 0..40_000_u32 {
+            let index = (k * 7_919) % 40_000;
+            thinning.push([(index % 200) as f32 * 0.1, (index / 200) as f32 * 0.1, 400.0]);
+            assert!(thinning.positions_m.len() <= 5_000);
+        }
+        let (cloud, cube_m) = thinning.finish();
+        let cube_m = cube_m.unwrap();
+        assert!((0.2..0.5).contains(&cube_m), "{cube_m}");
+        assert!(cloud.positions_m.len() > 1_500, "{}", cloud.positions_m.len());
+        let mut per_metre = [0; 400];
+        for p in &cloud.positions_m {
+            per_metre[p[1] as usize * 20 + p[0] as usize] += 1;
+        }
+        assert!(per_metre.iter().all(|count| (4..=25).contains(count)), "{per_metre:?}");
+    }
+
+    #[test]
+    fn few_points_are_kept_as_they_are() {
+        let mut thinning = ThinningCloud::new(10, 3);
+        let points = [[1.0, 2.0, 3.0], [1.0, 2.0, 3.0], [4.0, 5.0, 6.0]];
+        points.iter().for_each(|p| thinning.push(*p));
+        let (cloud, cube_m) = thinning.finish();
+        assert_eq!((cloud.positions_m.as_slice(), cube_m), (points.as_slice(), None));
+    }
 
     proptest! {
         #[test]

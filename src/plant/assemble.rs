@@ -4,7 +4,7 @@ use super::ids::{BenchId, LineId, ModuleId, PlantId, SectorId};
 use super::model::{Bench, Line, Module, ModuleStatus, PlantModel, Sector, Warning};
 use crate::fusion::{Fused, View};
 use crate::geometry::GeodeticReference;
-use crate::refinement::RefinedBench;
+use crate::refinement::{Refined, RefinedBench};
 use nalgebra::{Vector2, Vector3};
 use rstar::RTree;
 use rstar::primitives::GeomWithData;
@@ -25,7 +25,7 @@ pub struct Identity<'a> {
 pub fn assemble(
     views: &[View<'_>],
     fused: &Fused,
-    refined: &[RefinedBench],
+    refined: &Refined,
     reference: GeodeticReference,
     vertical_datum: String,
     identity: &Identity<'_>,
@@ -34,7 +34,7 @@ pub fn assemble(
     let mut drafts: Vec<Draft> = Vec::new();
     for (line_index, line) in fused.lines.iter().enumerate() {
         for &bench_index in &line.benches {
-            let (bench, refined) = (&fused.benches[bench_index], &refined[bench_index]);
+            let (bench, refined) = (&fused.benches[bench_index], &refined.benches[bench_index]);
             for (module, position) in bench.modules.iter().zip(&refined.modules) {
                 drafts.push(Draft { line_index, bench_index, module, position, bench: refined });
             }
@@ -48,6 +48,7 @@ pub fn assemble(
         survey: identity.survey.to_owned(),
         reference,
         vertical_datum,
+        alignment: refined.alignment.clone(),
         lines: Vec::new(),
         benches: Vec::new(),
         sectors: Vec::new(),

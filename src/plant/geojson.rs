@@ -54,7 +54,7 @@ impl PlantModel {
     /// The members of a feature collection that say what it is: model version, survey, reference frame, vertical datum.
     pub fn collection_properties(&self, layer: Layer) -> Map<String, Value> {
         let origin = self.reference.origin;
-        let Value::Object(members) = json!({
+        let Value::Object(mut members) = json!({
             "name": self.plant_name,
             "plant": self.plant,
             "layer": layer.as_str(),
@@ -70,6 +70,9 @@ impl PlantModel {
         }) else {
             unreachable!("an object literal is an object")
         };
+        if let Some(alignment) = &self.alignment {
+            members.insert("alignment".to_owned(), json!(alignment));
+        }
         members
     }
 

@@ -2,6 +2,7 @@
 
 use super::ids::{BenchId, LineId, ModuleId, PlantId, SectorId};
 use crate::geometry::GeodeticReference;
+use crate::refinement::alignment::Alignment;
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
@@ -144,6 +145,9 @@ pub struct PlantModel {
     pub reference: GeodeticReference,
     /// What heights refer to, as far as it is known.
     pub vertical_datum: String,
+    /// How it was brought onto known places, if any were given.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub alignment: Option<Alignment>,
     pub lines: Vec<Line>,
     pub benches: Vec<Bench>,
     pub sectors: Vec<Sector>,

@@ -1,14 +1,17 @@
-//! Point clouds in PLY, ASCII or binary: positions, and normals where there are any. The size that a header promises is
-//! checked against the file before anything is allocated.
+//! Point clouds in PLY, ASCII or binary: positions, read as a stream and thinned as they come where there are very many.
+//! The size that a header promises is checked against the file before anything is allocated.
 
 use super::error::ReconstructionError;
 use crate::geometry::PointCloud;
+use crate::geometry::point_cloud::ThinningCloud;
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 
-/// Most points that are read, a bound on memory (24 bytes each).
-const MAX_POINTS: u64 = 200_000_000;
+/// Most points that a file may promise.
+const MAX_POINTS: u64 = 2_000_000_000;
+/// Most points that are kept, a bound on memory (12 bytes each, and 16 while they are thinned).
+const MOST_KEPT: usize = 16_000_000;
 const MAX_HEADER_BYTES: usize = 64 * 1024;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -80,12 +83,12 @@ struct Header {
     encoding: Encoding,
     vertices: u64,
     properties: Vec<(String, Scalar)>,
-    /// Where each of x, y, z, nx, ny, nz stands among the properties.
-    fields: [Option<usize>; 6],
+    /// Where each of x, y, z stands among the properties.
+    fields: [usize; 3],
 }
 
-/// Reads the vertices of a PLY file: positions in metres in the file's own frame, and normals if all three are there.
-/// Points with a coordinate that is not finite are left out.
+/// Reads the vertices of a PLY file: positions in metres in the file's own frame. Points with a coordinate that is not
+/// finite are left out; of more than 16 million points one in each cube of a regular grid is kept.
 ///
 /// # Errors
 /// An empty cloud, fewer points than promised, more than can be held, or a header that is not PLY.
@@ -115,18 +118,10 @@ pub fn read(path: &Path) -> Result<PointCloud, ReconstructionError> {
     if held < header.vertices {
         return Err(ReconstructionError::TruncatedCloud { path: path.to_owned(), promised: header.vertices, held });
     }
-    let count = header.vertices as usize;
-    let with_normals = header.fields[3..].iter().all(Option::is_some);
-    let mut cloud = PointCloud {
-        positions_m: Vec::with_capacity(count),
-        normals: Vec::with_capacity(if with_normals { count } else { 0 }),
-    };
-    let mut push = |values: [f32; 6]| {
-        if values.iter().all(|v| v.is_finite()) {
-            cloud.positions_m.push([values[0], values[1], values[2]]);
-            if with_normals {
-                cloud.normals.push([values[3], values[4], values[5]]);
-            }
+    let mut thinning = ThinningCloud::new(MOST_KEPT, header.vertices as usize);
+    let mut push = |position: [f32; 3]| {
+        if position.iter().all(|value| value.is_finite()) {
+            thinning.push(position);
         }
     };
     match header.encoding {
@@ -138,7 +133,7 @@ pub fn read(path: &Path) -> Result<PointCloud, ReconstructionError> {
                 offsets.push((offset, *scalar));
                 offset += scalar.size();
             }
-            let fields = header.fields.map(|field| field.map(|index| offsets[index]));
+            let fields = header.fields.map(|index| offsets[index]);
             let mut record = vec![0_u8; record_bytes];
             for done in 0..header.vertices {
                 reader.read_exact(&mut record).map_err(|error| match error.kind() {
@@ -149,13 +144,11 @@ pub fn read(path: &Path) -> Result<PointCloud, ReconstructionError> {
                     },
                     _ => unreadable(error),
                 })?;
-                push(fields.map(|field| match field {
-                    Some((at, scalar)) => scalar.read(&record[at..], encoding == Encoding::BigEndian),
-                    None => 0.0,
-                }));
+                push(fields.map(|(at, scalar)| scalar.read(&record[at..], encoding == Encoding::BigEndian)));
             }
         }
     }
+    let (cloud, _) = thinning.finish();
     if cloud.positions_m.is_empty() {
         return Err(ReconstructionError::EmptyCloud { path: path.to_owned() });
     }
@@ -166,7 +159,7 @@ fn read_ascii(
     path: &Path,
     reader: &mut impl BufRead,
     header: &Header,
-    push: &mut impl FnMut([f32; 6]),
+    push: &mut impl FnMut([f32; 3]),
 ) -> Result<(), ReconstructionError> {
     let mut line = Vec::new();
     for done in 0..header.vertices {
@@ -188,10 +181,10 @@ fn read_ascii(
             what: format!("point {} does not hold {} numbers", done + 1, header.properties.len()),
         };
         let text = std::str::from_utf8(&line).map_err(|_| malformed())?;
-        let mut values = [0.0_f32; 6];
+        let mut values = [0.0_f32; 3];
         let mut words = 0;
         for (index, word) in text.split_ascii_whitespace().enumerate() {
-            if let Some(slot) = header.fields.iter().position(|field| *field == Some(index)) {
+            if let Some(slot) = header.fields.iter().position(|field| *field == index) {
                 values[slot] = word.parse().map_err(|_| malformed())?;
             }
             words = index + 1;
@@ -259,16 +252,15 @@ fn read_header(path: &Path, reader: &mut impl BufRead) -> Result<(Header, u64), 
             _ => {}
         }
     }
-    let fields =
-        ["x", "y", "z", "nx", "ny", "nz"].map(|name| properties.iter().position(|(property, _)| property == name));
-    if fields[..3].iter().any(Option::is_none) {
+    let place = |name: &str| properties.iter().position(|(property, _)| property == name);
+    let (Some(x), Some(y), Some(z)) = (place("x"), place("y"), place("z")) else {
         return Err(malformed("its vertices have no x, y and z".to_owned()));
-    }
+    };
     let header = Header {
         encoding: encoding.ok_or_else(|| malformed("it names no format".to_owned()))?,
         vertices: vertices.ok_or_else(|| malformed("it has no vertices".to_owned()))?,
+        fields: [x, y, z],
         properties,
-        fields,
     };
     Ok((header, consumed as u64))
 }
@@ -293,7 +285,6 @@ mod tests {
         let expected = [[1.5_f32, -2.0, 400.25], [3.0, 4.0, 401.0]];
         let text = read(file(&ascii(2, "1.5 -2 400.25 0 0 1 7\n3 4 401 0 1 0 9\n")).path()).unwrap();
         assert_eq!(text.positions_m, expected);
-        assert_eq!(text.normals, [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]]);
         for big in [false, true] {
             let name = if big { "binary_big_endian" } else { "binary_little_endian" };
             let mut bytes = format!(
@@ -315,7 +306,6 @@ mod tests {
             }
             let binary = read(file(&bytes).path()).unwrap();
             assert_eq!(binary.positions_m, expected);
-            assert!(binary.normals.is_empty());
             bytes.truncate(bytes.len() - 5);
             assert!(matches!(
                 read(file(&bytes).path()),

@@ -1,17 +1,26 @@
 //! From what the views say of each module to regular benches in space (paper, 3.6).
 
-pub mod lattice_fit;
-pub mod paper;
+mod adjustment;
+pub mod alignment;
+mod lattice;
+mod normal;
+mod paper;
+mod scale;
+mod spacing;
+mod uncertainty;
+mod views;
 
 use crate::fusion::{Fused, View};
-use nalgebra::Vector3;
+use crate::geometry::{Pose, Similarity};
+pub use alignment::{Alignment, Control, ControlError};
+use nalgebra::{Rotation3, Vector3};
 use serde::{Deserialize, Serialize};
 
 /// How positions are refined.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Method {
-    /// The lattice of each bench, estimated from the pixels of all views at once.
+    /// The lattices of all benches and the poses of all views, estimated together from the pixels of all views.
     #[default]
     Lattice,
     /// Mean cloud positions, a RANSAC line per row, and uniform spacing (paper, 3.6), to compare with.
@@ -24,6 +33,8 @@ pub struct RefinementOptions {
     pub method: Method,
     /// Known spacing of module centres along and across the row, metres: fixes the scale of the model.
     pub spacing_m: Option<[f64; 2]>,
+    /// Known width (along the row) and height (across it) of a module's face, metres: fixes the scale likewise.
+    pub module_size_m: Option<[f64; 2]>,
     /// Seed of the paper's RANSAC.
     pub seed: u64,
 }
@@ -32,7 +43,7 @@ pub struct RefinementOptions {
 #[derive(Debug, Clone)]
 pub struct RefinedModule {
     pub center_m: Vector3<f64>,
-    /// One standard deviation east, north, up, metres.
+    /// One standard deviation east, north, up, relative to the plant around it, metres.
     pub sigma_m: Option<Vector3<f64>>,
 }
 
@@ -56,47 +67,67 @@ impl RefinedBench {
     }
 }
 
-/// Refines every bench. One entry per fused bench, in its order.
-pub fn refine(views: &[View<'_>], fused: &Fused, options: &RefinementOptions) -> Vec<RefinedBench> {
-    let mut refined = match options.method {
-        Method::Lattice => lattice_fit::refine(views, &fused.benches),
-        Method::Paper => paper::refine(views, &fused.benches, options.seed),
-    };
-    if let Some(spacing_m) = options.spacing_m {
-        fix_scale(fused, &mut refined, spacing_m);
-    }
-    refined
+/// The plant in space.
+#[derive(Debug, Clone)]
+pub struct Refined {
+    /// One per fused bench, in its order.
+    pub benches: Vec<RefinedBench>,
+    /// One per view: its pose as the benches have it.
+    pub poses: Vec<Pose>,
+    /// How all was brought onto known places, if it was.
+    pub alignment: Option<Alignment>,
 }
 
-/// Scales the whole model about its middle so that neighbouring modules stand as far apart as is known (the scale is what
-/// GNSS leaves weakest).
-fn fix_scale(fused: &Fused, refined: &mut [RefinedBench], spacing_m: [f64; 2]) {
-    let mut ratios = Vec::new();
-    for (bench, positions) in fused.benches.iter().zip(refined.iter()) {
-        let place = |row: i32, col: i32| {
-            let index = bench.modules.binary_search_by_key(&(row, col), |m| (m.row, m.col)).ok()?;
-            Some(positions.modules[index].center_m)
-        };
-        for module in &bench.modules {
-            for (axis, step) in [(0, (0, 1)), (1, (1, 0))] {
-                let pair = (place(module.row, module.col), place(module.row + step.0, module.col + step.1));
-                if let (Some(from), Some(to)) = pair {
-                    ratios.push(spacing_m[axis] / (to - from).norm());
-                }
+impl Refined {
+    /// Mean of all modules, metres.
+    fn middle(&self) -> Vector3<f64> {
+        let count = self.benches.iter().map(|bench| bench.modules.len()).sum::<usize>().max(1) as f64;
+        self.benches.iter().flat_map(|b| &b.modules).map(|m| m.center_m).sum::<Vector3<f64>>() / count
+    }
+
+    /// Moves, turns and scales everything.
+    fn transform(&mut self, motion: &Similarity) {
+        let share = motion.rotation.matrix().map(|value| value * value) * (motion.scale * motion.scale);
+        for bench in &mut self.benches {
+            for module in &mut bench.modules {
+                module.center_m = motion.apply(&module.center_m);
+                module.sigma_m = module.sigma_m.map(|s| (share * s.component_mul(&s)).map(f64::sqrt));
             }
+            bench.along = motion.rotation * bench.along;
+            bench.across = motion.rotation * bench.across;
+            bench.module_size_m = bench.module_size_m.map(|size| size * motion.scale);
+        }
+        for pose in &mut self.poses {
+            let center = motion.apply(&pose.center());
+            pose.camera_from_world *= motion.rotation.inverse();
+            pose.translation_m = -(pose.camera_from_world * center);
         }
     }
-    if ratios.is_empty() {
-        return;
+
+    /// Scales everything about its middle.
+    fn scale(&mut self, scale: f64) {
+        let middle = self.middle();
+        self.transform(&Similarity { scale, rotation: Rotation3::identity(), translation_m: middle * (1.0 - scale) });
     }
-    ratios.sort_by(f64::total_cmp);
-    let scale = ratios[ratios.len() / 2];
-    let count = refined.iter().map(|bench| bench.modules.len()).sum::<usize>() as f64;
-    let middle = refined.iter().flat_map(|b| &b.modules).map(|m| m.center_m).sum::<Vector3<f64>>() / count;
-    for bench in refined {
-        for module in &mut bench.modules {
-            module.center_m = middle + (module.center_m - middle) * scale;
-        }
-        bench.module_size_m = bench.module_size_m.map(|size| size * scale);
+}
+
+/// Refines every bench.
+pub fn refine(views: &[View<'_>], fused: &Fused, options: &RefinementOptions) -> Refined {
+    let mut refined = match options.method {
+        Method::Lattice => adjustment::refine(views, &fused.benches),
+        Method::Paper => Refined {
+            benches: paper::refine(views, &fused.benches, options.seed),
+            poses: views.iter().map(|view| view.shot.pose).collect(),
+            alignment: None,
+        },
+    };
+    let scale = match (options.spacing_m, options.module_size_m) {
+        (Some(spacing_m), _) => scale::by_spacing(fused, &refined, spacing_m),
+        (None, Some(size_m)) => scale::by_module_size(fused, &refined, size_m),
+        (None, None) => None,
+    };
+    if let Some(scale) = scale {
+        refined.scale(scale);
     }
+    refined
 }

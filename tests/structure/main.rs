@@ -5,7 +5,7 @@ use heliomap::fusion::{self, Fused, FusionOptions, View};
 use heliomap::layout::{self, Layout, LayoutOptions};
 use heliomap::plant::assemble::{Identity, assemble};
 use heliomap::plant::{ModuleId, ModuleStatus, PlantId, PlantModel};
-use heliomap::refinement::{self, RefinedBench, RefinementOptions};
+use heliomap::refinement::{self, Refined, RefinementOptions};
 use heliomap::simulator::{
     Errors, Flight, FoundModule, LayoutKind, PlantSpec, Simulation, StructureReport, simulate, structure_report,
 };
@@ -18,7 +18,7 @@ struct Mapped {
     simulation: Simulation,
     layouts: Vec<Layout>,
     fused: Fused,
-    refined: Vec<RefinedBench>,
+    refined: Refined,
 }
 
 fn lay_out(detections: &[ImageDetections]) -> Vec<Layout> {
@@ -51,7 +51,9 @@ impl Mapped {
         let mut found = Vec::new();
         for (line, members) in self.fused.lines.iter().enumerate() {
             for &bench in &members.benches {
-                for (module, refined) in self.fused.benches[bench].modules.iter().zip(&self.refined[bench].modules) {
+                for (module, refined) in
+                    self.fused.benches[bench].modules.iter().zip(&self.refined.benches[bench].modules)
+                {
                     found.push(FoundModule {
                         center_enu_m: refined.center_m,
                         line: format!("L{line}"),
