@@ -10,7 +10,7 @@
 use super::lattice::{BenchMatrix, BenchVector, Lattice, PARAMS, centered, median};
 use super::normal::{Group, Normal, Sight, Spreads, Step};
 use super::spacing::{self, Spacing};
-use super::uncertainty;
+use super::uncertainty::{self, Uncertainty};
 use super::views::AdjustedView;
 use super::{Refined, RefinedBench, RefinedModule};
 use crate::fusion::{FusedBench, View};
@@ -35,12 +35,12 @@ const SAMPLED: usize = 200_000;
 pub(super) fn refine(views: &[View<'_>], benches: &[FusedBench]) -> Refined {
     let mut problem = Problem::new(views, benches);
     problem.solve();
-    let covariances =
-        uncertainty::covariances(&problem.linearised(), &problem.lattices, &problem.views, &problem.spreads);
+    let uncertainties =
+        uncertainty::of_benches(&problem.linearised(), &problem.lattices, &problem.views, &problem.spreads);
     let benches = benches
         .par_iter()
-        .zip(problem.lattices.par_iter().zip(&covariances))
-        .map(|(bench, (lattice, covariance))| refined(views, &problem.views, bench, lattice, covariance))
+        .zip(problem.lattices.par_iter().zip(&uncertainties))
+        .map(|(bench, (lattice, uncertainty))| refined(views, &problem.views, bench, lattice, uncertainty))
         .collect();
     Refined { benches, poses: problem.views.iter().map(AdjustedView::pose).collect(), alignment: None }
 }
@@ -233,8 +233,9 @@ impl Problem {
             }
             spent += 3.0;
             for (group, variance) in groups.iter().zip(normal.offset_variances(bench)) {
-                squares += group.offset_px.norm_squared();
-                determined += 2.0 * (1.0 - variance / (before_px * before_px)).max(0.0);
+                let trust = group.trust(&self.spreads);
+                squares += trust * group.offset_px.norm_squared();
+                determined += 2.0 * (1.0 - trust * variance / (before_px * before_px)).max(0.0);
             }
         }
         spent += 6.0 * self.views.len() as f64;
@@ -334,7 +335,7 @@ fn refined(
     adjusted: &[AdjustedView],
     bench: &FusedBench,
     lattice: &Lattice,
-    covariance: &BenchMatrix,
+    uncertainty: &Uncertainty,
 ) -> RefinedBench {
     let modules = bench
         .modules
@@ -342,15 +343,20 @@ fn refined(
         .map(|module| {
             let (c, r) = centered(bench, module.row, module.col);
             let factors = lattice.factors(c, r);
-            let sigma_m = Vector3::from_fn(|axis, _| {
-                let mut variance = 0.0;
-                for i in 0..PARAMS / 3 {
-                    for j in 0..PARAMS / 3 {
-                        variance += factors[i] * factors[j] * covariance[(3 * i + axis, 3 * j + axis)];
+            let spread_m = |covariance: &BenchMatrix| {
+                Vector3::from_fn(|axis, _| {
+                    let mut variance = 0.0;
+                    for i in 0..PARAMS / 3 {
+                        for j in 0..PARAMS / 3 {
+                            variance += factors[i] * factors[j] * covariance[(3 * i + axis, 3 * j + axis)];
+                        }
                     }
-                }
-                variance.max(0.0).sqrt()
-            });
+                    variance.max(0.0).sqrt()
+                })
+            };
+            let by_boxes_m = spread_m(&uncertainty.boxes);
+            let shared_m = by_boxes_m * (uncertainty.shared_m / by_boxes_m.xy().amax().max(1e-9));
+            let sigma_m = (spread_m(&uncertainty.whole).map(|s| s * s) + shared_m.map(|s| s * s)).map(f64::sqrt);
             let known = sigma_m.iter().all(|sigma| sigma.is_finite() && *sigma > 0.0);
             RefinedModule { center_m: lattice.position(c, r), sigma_m: known.then_some(sigma_m) }
         })

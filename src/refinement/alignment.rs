@@ -330,10 +330,11 @@ fn fit(pairs: &[(Vector3<f64>, Vector3<f64>)], with_scale: bool) -> Similarity {
     }
     let mut spread: Vec<f64> = scatter.symmetric_eigenvalues().iter().map(|value| value.max(0.0).sqrt()).collect();
     spread.sort_by(f64::total_cmp);
-    if spread[1] > 0.05 * spread[2] && spread[1] > 1.0 {
-        if let Some(motion) = Similarity::fit(&model, &known, with_scale) {
-            return motion;
-        }
+    if spread[1] > 0.05 * spread[2]
+        && spread[1] > 1.0
+        && let Some(motion) = Similarity::fit(&model, &known, with_scale)
+    {
+        return motion;
     }
     // About the vertical alone.
     let (mut cos, mut sin, mut size) = (0.0, 0.0, 0.0);

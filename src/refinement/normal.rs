@@ -26,6 +26,14 @@ pub(super) struct Group {
     pub(super) offset_px: Vector2<f64>,
 }
 
+impl Group {
+    /// How much the group counts as one of the rest, 0 to 1.5: offsets have long tails (Student's t with four degrees of
+    /// freedom), for a view whose columns were matched one off displaces a bench by a whole module.
+    pub(super) fn trust(&self, spreads: &Spreads) -> f64 {
+        6.0 / (4.0 + self.offset_px.norm_squared() / (spreads.group_px * spreads.group_px))
+    }
+}
+
 /// How much things may deviate, one standard deviation each.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Spreads {
@@ -213,10 +221,11 @@ impl Normal {
         self.rows[view].get(&other)
     }
 
-    /// The view that shows most of a bench.
-    pub(super) fn main_view(&self, bench: usize) -> Option<usize> {
+    /// The view that shows most of a bench; every bench was seen.
+    pub(super) fn main_view(&self, bench: usize) -> usize {
         let groups = &self.benches[bench].groups;
-        groups.iter().min_by(|a, b| a.offset.variance.total_cmp(&b.offset.variance)).map(|group| group.of_view)
+        let best = groups.iter().min_by(|a, b| a.offset.variance.total_cmp(&b.offset.variance));
+        best.map_or(0, |group| group.of_view)
     }
 
     /// A view and those that share most with it, at most `size` in all, sorted.
@@ -295,7 +304,7 @@ fn group_terms(
     let mut by_bench = OffsetByBench::zeros();
     let mut by_view = OffsetByView::zeros();
     let mut offset_right = Vector2::zeros();
-    let mut information = 1.0 / (spreads.group_px * spreads.group_px);
+    let mut information = group.trust(spreads) / (spreads.group_px * spreads.group_px);
     for sight in &group.sights {
         let [c, r] = sight.place.map(f64::from);
         let factors = lattice.factors(c, r);

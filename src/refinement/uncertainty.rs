@@ -5,6 +5,9 @@
 //! the views that share most with it are taken as a window; those outside count as known. Where the whole window stands,
 //! how it is turned and what its scale is cannot be told from images (GNSS tells, and control points), so these seven are
 //! taken out: what is stated is how far a module may stand off relative to the plant around it.
+//!
+//! Boxes err alike in all views, too: a detector sees the edge of a table otherwise than a seam, from wherever it looks.
+//! Of that residuals tell nothing. It is taken to be as large as what differs from view to view.
 
 use super::lattice::{BenchMatrix, Lattice, PARAMS};
 use super::normal::{Normal, Spreads};
@@ -18,33 +21,47 @@ const WINDOW: usize = 20;
 /// Up to this many views the variance of their corrections is taken exactly.
 const EXACT_VIEWS: usize = 60;
 
-/// The covariance of each bench's lattice (origin, steps, bend).
-pub(super) fn covariances(
+/// How well a bench is known: covariances of its lattice (origin, steps, bend).
+pub(super) struct Uncertainty {
+    /// In all, but for what its boxes have in common in all views.
+    pub(super) whole: BenchMatrix,
+    /// If all views were known.
+    pub(super) boxes: BenchMatrix,
+    /// What its boxes may have in common, metres on the ground.
+    pub(super) shared_m: f64,
+}
+
+/// How well each bench is known.
+pub(super) fn of_benches(
     normal: &Normal,
     lattices: &[Lattice],
     views: &[AdjustedView],
     spreads: &Spreads,
-) -> Vec<BenchMatrix> {
+) -> Vec<Uncertainty> {
     let mut benches_of: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
     for bench in 0..lattices.len() {
-        if let Some(main) = normal.main_view(bench) {
-            benches_of.entry(main).or_default().push(bench);
-        }
+        benches_of.entry(normal.main_view(bench)).or_default().push(bench);
     }
-    let found: Vec<Vec<(usize, BenchMatrix)>> = benches_of
+    let found: Vec<Vec<(usize, Uncertainty)>> = benches_of
         .into_par_iter()
         .map(|(main, benches)| {
             let window = normal.window(main, WINDOW);
             let middle = benches.iter().map(|bench| lattices[*bench].terms[0]).sum::<Vector3<f64>>();
             let poses = pose_covariance(normal, &window, views, spreads, &(middle / benches.len() as f64));
-            benches.into_iter().map(|bench| (bench, bench_covariance(normal, bench, &window, &poses))).collect()
+            let shared_m = spreads.group_px / views[main].px_per_m();
+            benches
+                .into_iter()
+                .map(|bench| {
+                    let boxes = *normal.bench_alone(bench);
+                    let whole = boxes + carried_covariance(normal, bench, &window, &poses);
+                    (bench, Uncertainty { whole, boxes, shared_m })
+                })
+                .collect()
         })
         .collect();
-    let mut covariances = vec![BenchMatrix::zeros(); lattices.len()];
-    for (bench, covariance) in found.into_iter().flatten() {
-        covariances[bench] = covariance;
-    }
-    covariances
+    let mut sorted: Vec<(usize, Uncertainty)> = found.into_iter().flatten().collect();
+    sorted.sort_by_key(|(bench, _)| *bench);
+    sorted.into_iter().map(|(_, uncertainty)| uncertainty).collect()
 }
 
 /// Covariance of the corrections of the views of a window, without the motion of the whole.
@@ -86,8 +103,8 @@ fn pose_covariance(
     covariance
 }
 
-/// Covariance of a bench: what its boxes leave open, and what the views of the window carry into it.
-fn bench_covariance(normal: &Normal, bench: usize, window: &[usize], poses: &DMatrix<f64>) -> BenchMatrix {
+/// Covariance of a bench that the views of the window carry into it.
+fn carried_covariance(normal: &Normal, bench: usize, window: &[usize], poses: &DMatrix<f64>) -> BenchMatrix {
     let mut carried = DMatrix::<f64>::zeros(PARAMS, 6 * window.len());
     for (view, solved) in normal.solved_crosses(bench) {
         if let Ok(place) = window.binary_search(&view) {
@@ -95,7 +112,7 @@ fn bench_covariance(normal: &Normal, bench: usize, window: &[usize], poses: &DMa
         }
     }
     let moved = &carried * poses * carried.transpose();
-    normal.bench_alone(bench) + BenchMatrix::from_iterator(moved.iter().copied())
+    BenchMatrix::from_iterator(moved.iter().copied())
 }
 
 /// Variance of each number of each view's correction; where there are many views, as if the others were known.

@@ -61,6 +61,11 @@ impl AdjustedView {
         }
     }
 
+    /// Pixels per metre on the ground in the middle of the view.
+    pub(super) fn px_per_m(&self) -> f64 {
+        (self.focal_px[0] + self.focal_px[1]) / 2.0 / self.pivot.z.max(0.1)
+    }
+
     pub(super) fn correction(&self) -> &Vector6<f64> {
         &self.correction
     }
