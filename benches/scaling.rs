@@ -186,6 +186,9 @@ fn cpu_s() -> f64 {
         / 100.0
 }
 
+/// A name, and what is drawn.
+type Series<'a> = (&'a str, &'a dyn Fn(&Figures) -> f64);
+
 /// Seconds and gigabytes over the number of modules, both axes logarithmic.
 fn plot(all: &[Figures], path: &Path) -> Result<()> {
     let area = SVGBackend::new(path, (900, 420)).into_drawing_area();
@@ -194,10 +197,9 @@ fn plot(all: &[Figures], path: &Path) -> Result<()> {
     let modules = |f: &Figures| f.modules as f64;
     let low = all.iter().map(modules).fold(f64::INFINITY, f64::min) * 0.8;
     let high = all.iter().map(modules).fold(0.0, f64::max) * 1.25;
-    let series: [(&str, &dyn Fn(&Figures) -> f64); 2] =
-        [("wall clock, s", &Figures::wall_s), ("CPU of all threads, s", &Figures::cpu_s)];
+    let series: [Series<'_>; 2] = [("wall clock, s", &Figures::wall_s), ("CPU of all threads, s", &Figures::cpu_s)];
     panel(&left, "Time over modules", [low, high], all, &series)?;
-    let series: [(&str, &dyn Fn(&Figures) -> f64); 2] =
+    let series: [Series<'_>; 2] =
         [("peak, GB", &|f| f.peak_bytes as f64 / 1e9), ("input alone, GB", &|f| f.input_bytes as f64 / 1e9)];
     panel(&right, "Memory over modules", [low, high], all, &series)?;
     area.present()?;
@@ -209,7 +211,7 @@ fn panel(
     title: &str,
     range: [f64; 2],
     all: &[Figures],
-    series: &[(&str, &dyn Fn(&Figures) -> f64)],
+    series: &[Series<'_>],
 ) -> Result<()> {
     let values = || series.iter().flat_map(|(_, value)| all.iter().map(value)).map(|v| v.max(1e-3));
     let (low, high) = (values().fold(f64::INFINITY, f64::min) * 0.7, values().fold(0.0, f64::max) * 1.5);

@@ -15,7 +15,7 @@ mod tests;
 pub use model::{ReferenceBench, ReferenceLine, ReferenceModel, ReferenceModule};
 pub use plots::write_plots;
 pub use read::read_model;
-pub use statistics::{Calibration, Differences, FiveNumbers, Spacing};
+pub use statistics::{Calibration, Differences, Distances, FiveNumbers, Spacing};
 pub use structure::{Convention, Level, LevelAgreement, Problem, Structure};
 
 use crate::geometry::Similarity;
@@ -102,6 +102,8 @@ pub struct Evaluation {
     pub after_rigid_fit: Differences,
     pub similarity_fit: Fit,
     pub after_similarity_fit: Differences,
+    /// Distances between modules, which no alignment can mend; `None` where no two stand far enough apart.
+    pub distances: Option<Distances>,
     pub plant_spacing: Spacing,
     pub truth_spacing: Spacing,
     /// The furthest off after the similarity fit.
@@ -177,6 +179,7 @@ pub fn evaluate(plant: &ReferenceModel, truth: &ReferenceModel) -> Result<Evalua
         after_rigid_fit: differences(&rigid)?,
         similarity_fit: described(&similarity),
         after_similarity_fit: differences(&similarity)?,
+        distances: Distances::of(&pairs.iter().map(|&(p, t)| (plant_m[p], truth_m[t])).collect::<Vec<_>>()),
         plant_spacing: Spacing::of(plant),
         truth_spacing: Spacing::of(truth),
         worst: worst(plant, truth, &pairs, &residuals_m),

@@ -24,6 +24,17 @@ impl fmt::Display for Evaluation {
         writeln!(f)?;
         self.positions(f)?;
         writeln!(f)?;
+        if let Some(distances) = &self.distances {
+            let percent = |share: f64| share * 100.0;
+            writeln!(
+                f,
+                "Distances of {} m and more are off by {:.3} % (median), {:.3} % at most",
+                distances.least_m,
+                percent(distances.median),
+                percent(distances.largest)
+            )?;
+            writeln!(f)?;
+        }
         writeln!(f, "Distance between neighbouring modules, metres")?;
         header(f)?;
         spacing(f, "plant", &self.plant_spacing)?;

@@ -104,6 +104,41 @@ impl Differences {
     }
 }
 
+/// How wrong distances between modules that stand far apart are, as shares of the true distance.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Distances {
+    /// Modules nearer to each other than this are not compared, metres.
+    pub least_m: f64,
+    /// How many distances were compared.
+    pub compared: usize,
+    pub median: f64,
+    pub largest: f64,
+}
+
+impl Distances {
+    const LEAST_M: f64 = 20.0;
+    /// Modules between all of which distances are compared; of more, evenly spread ones.
+    const MOST_MODULES: usize = 2_000;
+
+    /// The errors between all pairs of (plant, truth) positions in metres; `None` where no two are far enough apart.
+    pub fn of(positions_m: &[(Vector3<f64>, Vector3<f64>)]) -> Option<Self> {
+        let stride = positions_m.len().div_ceil(Self::MOST_MODULES).max(1);
+        let chosen: Vec<&(Vector3<f64>, Vector3<f64>)> = positions_m.iter().step_by(stride).collect();
+        let mut errors = Vec::new();
+        for (k, (plant, truth)) in chosen.iter().enumerate() {
+            for (other_plant, other_truth) in &chosen[..k] {
+                let true_m = (truth - other_truth).norm();
+                if true_m >= Self::LEAST_M {
+                    errors.push(((plant - other_plant).norm() / true_m - 1.0).abs());
+                }
+            }
+        }
+        let compared = errors.len();
+        let numbers = FiveNumbers::of(errors)?;
+        Some(Self { least_m: Self::LEAST_M, compared, median: numbers.median, largest: numbers.max })
+    }
+}
+
 /// Distances between neighbouring module centres of one model, metres (paper, Fig. 17).
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Spacing {
@@ -145,6 +180,17 @@ mod tests {
         assert_eq!(summary.values(), [1.0, 1.75, 2.5, 3.25, 4.0]);
         assert_eq!(FiveNumbers::of(vec![7.0]).unwrap().values(), [7.0; 5]);
         assert!(FiveNumbers::of(Vec::new()).is_none());
+    }
+
+    #[test]
+    fn distances_tell_the_scale_and_nothing_of_the_place() {
+        let truth: Vec<Vector3<f64>> = (0..50).map(|k| Vector3::new(f64::from(k), f64::from(k % 7), 1.0)).collect();
+        let scaled =
+            |scale: f64| -> Vec<_> { truth.iter().map(|t| (t * scale + Vector3::new(3.0, -8.0, 1.0), *t)).collect() };
+        let distances = Distances::of(&scaled(1.002)).unwrap();
+        assert!((distances.median - 0.002).abs() < 1e-9 && (distances.largest - 0.002).abs() < 1e-9);
+        assert!(Distances::of(&scaled(1.0)).unwrap().largest < 1e-12);
+        assert!(Distances::of(&scaled(1.0)[..15]).is_none());
     }
 
     #[test]

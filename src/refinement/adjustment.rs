@@ -19,8 +19,10 @@ use rayon::prelude::*;
 
 /// Standard deviation of a corner in units of that of a centre.
 const CORNER_SPREAD: f32 = 3.0;
-/// How well the cloud knows the place of a bench as a whole, metres.
-const CLOUD_SIGMA_M: f64 = 0.2;
+/// How well the cloud is taken to know the place of a bench before anything is known of it, and at best, metres: where
+/// views and cloud disagree the views are right.
+const FIRST_CLOUD_M: f64 = 2.0;
+const BEST_CLOUD_M: f64 = 0.2;
 /// How far from a right angle a table may be, as the cosine.
 const SQUARE_SIGMA: f64 = 0.003;
 /// How far a bench bends from straight over half its length, metres.
@@ -28,6 +30,9 @@ const BEND_SIGMA_M: f64 = 0.1;
 /// How much the ground that one view shows may be displaced before anything is known of it, metres.
 const FIRST_POSE_M: f64 = 0.3;
 const MOST_ROUNDS: usize = 12;
+/// Steps end when nothing moves further than this any more, metres, and spreads change by no more than this share.
+const SETTLED_M: f64 = 5e-4;
+const SETTLED: f64 = 0.05;
 /// Residuals looked at to tell how well boxes are centred.
 const SAMPLED: usize = 200_000;
 
@@ -52,6 +57,8 @@ struct Problem {
     views: Vec<AdjustedView>,
     spreads: Spreads,
     anchors: Vec<Anchor>,
+    /// How well the cloud knows the place of a bench, one standard deviation, metres.
+    cloud_m: f64,
     spacings: Vec<Spacing>,
 }
 
@@ -118,6 +125,7 @@ impl Problem {
                 pose_m: FIRST_POSE_M,
             },
             anchors,
+            cloud_m: FIRST_CLOUD_M,
             spacings,
         };
         problem.spreads.center_px = problem.center_spread_px();
@@ -145,10 +153,11 @@ impl Problem {
                 group_px: self.group_spread_px(&normal, before.group_px),
                 pose_m: self.pose_spread_m(&normal, before.pose_m),
             };
+            self.cloud_m = self.cloud_spread_m();
             spacing::update(&mut self.spacings, &self.lattices);
-            let settled = |new: f64, old: f64| (new / old - 1.0).abs() < 0.02;
+            let settled = |new: f64, old: f64| (new / old - 1.0).abs() < SETTLED;
             if round >= 3
-                && moved_m < 5e-4
+                && moved_m < SETTLED_M
                 && settled(self.spreads.center_px, before.center_px)
                 && settled(self.spreads.group_px, before.group_px)
                 && settled(self.spreads.pose_m, before.pose_m)
@@ -181,7 +190,7 @@ impl Problem {
     fn prior(&self, bench: usize, normal: &mut BenchMatrix, right: &mut BenchVector) {
         let lattice = &self.lattices[bench];
         let anchor = &self.anchors[bench];
-        let known = 1.0 / (CLOUD_SIGMA_M * CLOUD_SIGMA_M);
+        let known = 1.0 / (self.cloud_m * self.cloud_m);
         for (term, share) in [(0, 1.0), (1, anchor.spread[0].max(0.25)), (2, anchor.spread[1].max(0.25))] {
             let off = anchor.lattice.terms[term] - lattice.terms[term];
             for axis in 0..3 {
@@ -241,6 +250,14 @@ impl Problem {
         spent += 6.0 * self.views.len() as f64;
         let left = (determined - spent).max(0.2 * determined);
         if left < 2.0 { before_px } else { (squares / left).sqrt().clamp(0.01, 60.0) }
+    }
+
+    /// Standard deviation of the cloud's places of benches: three times what those that several views show are off, for
+    /// they are all off the same way.
+    fn cloud_spread_m(&self) -> f64 {
+        let off = self.anchors.iter().zip(&self.lattices).zip(&self.groups).filter(|(_, groups)| groups.len() > 2);
+        let off = off.map(|((anchor, lattice), _)| (anchor.lattice.terms[0] - lattice.terms[0]).norm()).collect();
+        median(off).map_or(FIRST_CLOUD_M, |off_m| 3.0 * off_m).clamp(BEST_CLOUD_M, FIRST_CLOUD_M)
     }
 
     /// Standard deviation of the poses' errors as they move the ground, likewise.

@@ -3,10 +3,13 @@
 use super::Refined;
 use crate::fusion::Fused;
 
-/// Sides of a module that differ by less than this share cannot tell seam from scale.
-const UNEQUAL: f64 = 0.2;
-/// Widest seam between two modules of a bench, metres.
-const WIDEST_SEAM_M: f64 = 0.08;
+/// Seam between two modules that clamps hold, and its standard deviation, metres.
+const SEAM_M: f64 = 0.02;
+const SEAM_SIGMA_M: f64 = 0.004;
+/// Standard deviation of the size of boxes, as a share.
+const BOX_SIGMA: f64 = 0.01;
+/// Pitch and boxes contradict each other beyond this share.
+const CONTRADICTION: f64 = 0.015;
 
 /// Median distance of neighbouring modules along and across the row, over the whole plant, metres.
 fn pitches_m(fused: &Fused, refined: &Refined) -> [Option<f64>; 2] {
@@ -44,24 +47,22 @@ pub(super) fn by_spacing(fused: &Fused, refined: &Refined, spacing_m: [f64; 2]) 
 }
 
 /// What the model must be multiplied by so that modules have the size that is known, width along the row and height
-/// across it. Pitches are known to a few tenths of a millimetre, boxes hardly to one percent: the pitch is a side and a
-/// seam, and with seams alike both ways the two pitches tell scale and seam. Where there is one row, or modules are
-/// square, the boxes must do.
+/// across it. Boxes are hardly right to one percent of a module; the pitch along the row is known to a few tenths of a
+/// millimetre, but is a module and its seam, which the clamps between modules make about 2 cm wide. Both are weighed,
+/// unless they contradict each other: then modules are mounted otherwise, and the boxes decide.
 pub(super) fn by_module_size(fused: &Fused, refined: &Refined, size_m: [f64; 2]) -> Option<f64> {
     let [width_m, height_m] = size_m;
-    if let [Some(along_m), Some(across_m)] = pitches_m(fused, refined)
-        && (height_m - width_m).abs() > UNEQUAL * width_m.min(height_m)
-    {
-        let scale = (height_m - width_m) / (across_m - along_m);
-        let seam_m = scale * along_m - width_m;
-        if (0.0..WIDEST_SEAM_M).contains(&seam_m) {
-            return Some(scale);
-        }
-    }
     let ratios: Vec<f64> = refined
         .benches
         .iter()
-        .flat_map(|bench| [width_m / bench.module_size_m[0], height_m / bench.module_size_m[1]])
+        .map(|bench| (width_m * height_m / (bench.module_size_m[0] * bench.module_size_m[1])).sqrt())
         .collect();
-    super::lattice::median(ratios)
+    let by_boxes = super::lattice::median(ratios)?;
+    let Some(along_m) = pitches_m(fused, refined)[0] else { return Some(by_boxes) };
+    let by_pitch = (width_m + SEAM_M) / along_m;
+    if (by_pitch / by_boxes - 1.0).abs() > CONTRADICTION {
+        return Some(by_boxes);
+    }
+    let (boxes, pitch) = (BOX_SIGMA.powi(-2), (SEAM_SIGMA_M / width_m).powi(-2));
+    Some((by_boxes * boxes + by_pitch * pitch) / (boxes + pitch))
 }

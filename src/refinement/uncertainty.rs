@@ -7,7 +7,7 @@
 //! taken out: what is stated is how far a module may stand off relative to the plant around it.
 //!
 //! Boxes err alike in all views, too: a detector sees the edge of a table otherwise than a seam, from wherever it looks.
-//! Of that residuals tell nothing. It is taken to be as large as what differs from view to view.
+//! Of that residuals tell nothing. It is taken to be half as large as what differs from view to view.
 
 use super::lattice::{BenchMatrix, Lattice, PARAMS};
 use super::normal::{Normal, Spreads};
@@ -48,7 +48,7 @@ pub(super) fn of_benches(
             let window = normal.window(main, WINDOW);
             let middle = benches.iter().map(|bench| lattices[*bench].terms[0]).sum::<Vector3<f64>>();
             let poses = pose_covariance(normal, &window, views, spreads, &(middle / benches.len() as f64));
-            let shared_m = spreads.group_px / views[main].px_per_m();
+            let shared_m = 0.5 * spreads.group_px / views[main].px_per_m();
             benches
                 .into_iter()
                 .map(|bench| {
