@@ -105,7 +105,10 @@ impl Default for MapOptions {
 
 impl MapOptions {
     /// Refuses values that make no sense.
-    fn check(&self) -> Result<(), MapError> {
+    ///
+    /// # Errors
+    /// The first option that cannot be used, and why.
+    pub fn check(&self) -> Result<(), MapError> {
         let refuse = |message: &str| {
             Err(MapError::Input { code: "option_invalid", message: format!("{message}; leave it out or correct it") })
         };

@@ -7,6 +7,7 @@ use super::paging::{List, PageQuery};
 use super::surveys::missing_views;
 use crate::pipeline::{MapOptions, Stage};
 use crate::plant::{PlantId, Warning};
+use crate::refinement::Control;
 use crate::store::{Cancelled, Enqueued, Job, JobId, JobRequest, JobState, SurveyId};
 use axum::Json;
 use axum::body::Bytes;
@@ -30,6 +31,18 @@ pub struct StartJob {
     /// Known spacing of module centres along and across the row, metres.
     #[schema(value_type = Option<Vec<f64>>, min_items = 2, max_items = 2)]
     pub spacing_m: Option<[f64; 2]>,
+    /// Known size of a module's face, width along the row and height across it, metres; in place of `spacing_m`.
+    #[schema(value_type = Option<Vec<f64>>, min_items = 2, max_items = 2)]
+    pub module_size_m: Option<[f64; 2]>,
+    /// Places that are known, to align the model by: `points` marked in images (`name`, `wgs84` or `enu_m`,
+    /// `observations` of `image` and `pixel`) and `modules` (`label`, `wgs84` or `enu_m`).
+    #[schema(value_type = Option<Object>)]
+    pub control: Option<Control>,
+    /// Whether known places set the scale too; where it is not given, they do unless a spacing or module size does.
+    pub control_scale: Option<bool>,
+    /// What heights refer to, stated in the model.
+    #[schema(max_length = 200)]
+    pub vertical_datum: Option<String>,
     /// Seed of every random choice, 1 where it is not given.
     pub seed: Option<u64>,
     /// Among waiting jobs the highest is taken first; 0 where it is not given.
@@ -53,13 +66,19 @@ impl StartJob {
         if self.spacing_m.as_ref().is_some_and(|spacing| !spacing.iter().all(positive)) {
             return refuse("spacing_m must be two positive numbers of metres; leave it out where it is not known");
         }
-        Ok(MapOptions {
+        let options = MapOptions {
             rows_per_bench: self.rows_per_bench,
             max_gsd_m_per_px: self.max_gsd_m_per_px,
             spacing_m: self.spacing_m,
+            module_size_m: self.module_size_m,
+            control: self.control,
+            control_scale: self.control_scale,
+            vertical_datum: self.vertical_datum,
             seed: self.seed.unwrap_or(MapOptions::default().seed),
             ..MapOptions::default()
-        })
+        };
+        options.check().map_err(|error| ApiError::new(Code::InvalidFields, error.to_string()))?;
+        Ok(options)
     }
 }
 
