@@ -364,8 +364,8 @@ pub fn map_folder(
     Ok(Mapping { model, timings, photos, shots, detections, layouts, fused, refined })
 }
 
-/// The photos of a folder as OpenSfM leaves it, with the ground sampling distance of each in metres per pixel where the
-/// reconstruction tells: what [`map_folder`] searches, by resolution still unsorted.
+/// The photos of a folder as OpenSfM leaves it that [`map_folder`] searches, those too coarse to resolve modules left out,
+/// with the ground sampling distance of each in metres per pixel where the reconstruction tells.
 ///
 /// # Errors
 /// Broken input, by file.
@@ -373,7 +373,8 @@ pub fn photos_of(folder: &Path, max_image_pixels: u64) -> Result<Vec<(Photo, Opt
     let mut project = reconstruction::opensfm::read(folder, max_image_pixels)?;
     let cloud = cloud_of(&mut project);
     let gsd_m = ground_sampling_distances(&project.reconstruction.shots, &cloud);
-    Ok(project.photos.into_iter().zip(gsd_m).collect())
+    let chosen = resolving_images(&project, &gsd_m, &MapOptions::default(), &mut Vec::new());
+    Ok(chosen.into_iter().map(|shot| (project.photos[shot].clone(), gsd_m[shot])).collect())
 }
 
 /// The points that modules are located by: the dense cloud, taken out of the project, or the sparse points where there is
