@@ -17,7 +17,7 @@ export ORT_DYLIB_PATH ?= $(abspath $(ORT_LIBRARY))
 HELIOMAP_DATA ?= $(wildcard ../shared/data)
 export HELIOMAP_DATA
 
-.PHONY: help setup web demo test lint unit kills structure bench scaling yolo-export openapi clean
+.PHONY: help setup web demo test lint unit kills tus structure bench scaling yolo-export openapi clean
 
 help: ## List the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -55,6 +55,18 @@ KILLS ?= 200
 kills: setup ## Kill server and worker at random (KILLS times): nothing is lost, models are those of a run without kills
 	$(CARGO) build --locked
 	$(PYTHON) tests/kills/kills.py --binary target/debug/heliomap --kills $(KILLS)
+
+tus: setup .venv/tus/done tests/tus/node_modules/done ## Upload 1 GB by two tus clients through 20 disconnects and a kill: the bytes agree
+	$(CARGO) build --locked
+	.venv/tus/bin/python tests/tus/tus.py --binary target/debug/heliomap
+
+.venv/tus/done: tests/tus/requirements.txt
+	@$(PYTHON) -m venv .venv/tus && .venv/tus/bin/pip install --quiet --disable-pip-version-check --requirement $<
+	@touch $@
+
+tests/tus/node_modules/done: tests/tus/package-lock.json
+	@cd tests/tus && $(NPM) ci --no-audit --no-fund --loglevel=error
+	@touch $@
 
 structure: setup ## Survey of every kind of simulated layout: how many come out exactly
 	$(CARGO) test --locked --test structure -- --ignored --nocapture
