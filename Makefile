@@ -49,7 +49,7 @@ lint: setup ## Formatting and lints, warnings are errors
 	$(CARGO) clippy --locked --all-targets -- --deny warnings
 
 unit: setup ## Tests alone
-	$(CARGO) test --locked
+	tests/with-postgres.sh $(CARGO) test --locked
 
 KILLS ?= 200
 kills: setup ## Kill server and worker at random (KILLS times): nothing is lost, models are those of a run without kills

@@ -131,11 +131,21 @@ pub struct OpenapiArgs {
 }
 
 /// Where the service keeps what it remembers.
-#[derive(Debug, Clone, Args)]
+#[derive(Clone, Args)]
 pub struct StorageArgs {
     /// Folder of the database and the uploaded files; created where it is missing.
     #[arg(long, env = "HELIOMAP_DATA_DIR", default_value = "heliomap-data", value_name = "DIR")]
     pub data_dir: PathBuf,
+    /// Postgres database to use in place of the SQLite file in the data folder, `postgres://USER:PASSWORD@HOST/NAME`.
+    #[arg(long, env = "HELIOMAP_DATABASE", hide_env_values = true, value_name = "URL")]
+    pub database: Option<String>,
+}
+
+/// The database's URL may hold a password, which no log shall.
+impl std::fmt::Debug for StorageArgs {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("StorageArgs").field("data_dir", &self.data_dir).finish_non_exhaustive()
+    }
 }
 
 /// What finds modules in photos.

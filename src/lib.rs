@@ -4,6 +4,8 @@
 //! `detection`, `layout`, `fusion`, `refinement`, `plant`, `pipeline`; then `store` and `jobs`; then `http`. `overlay`
 //! and `evaluation` look at what the pipeline made; `simulator` makes plants with known truth for tests and benchmarks.
 
+#![allow(clippy::duplicate_mod, reason = "the store's methods are compiled once beside each database")]
+
 pub mod config;
 pub mod detection;
 pub mod evaluation;

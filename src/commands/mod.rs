@@ -12,7 +12,7 @@ pub mod worker;
 use anyhow::Context;
 use heliomap::config::{DetectorArgs, JobArgs, StorageArgs};
 use heliomap::jobs::{PipelineMapper, Worker, WorkerSettings};
-use heliomap::store::{Blobs, SqliteStore, Store, UploadStore};
+use heliomap::store::{Blobs, PostgresStore, SqliteStore, Store};
 use jiff::Timestamp;
 use std::sync::Arc;
 use std::time::Duration;
@@ -31,7 +31,11 @@ async fn open_storage(args: &StorageArgs) -> anyhow::Result<(Arc<dyn Store>, Blo
     let hint = || format!("cannot use the data folder {}; choose another with --data-dir", folder.display());
     let blobs = Blobs::in_folder(folder).with_context(hint)?;
     blobs.sweep_staging(STALE_UPLOADS).await.with_context(hint)?;
-    let store = SqliteStore::open(&folder.join("heliomap.db")).await.with_context(hint)?;
+    let store: Arc<dyn Store> = match &args.database {
+        // The URL may hold a password: it is not said again.
+        Some(url) => Arc::new(PostgresStore::open(url).await.context("cannot use the database of --database")?),
+        None => Arc::new(SqliteStore::open(&folder.join("heliomap.db")).await.with_context(hint)?),
+    };
     store.delete_expired_uploads(Timestamp::now()).await?;
     blobs.sweep_uploads(store.uploads().await?.into_iter().collect(), STALE_UPLOADS).await.with_context(hint)?;
     // A plant may have been deleted without its blobs, or while some were still coming.
@@ -39,7 +43,7 @@ async fn open_storage(args: &StorageArgs) -> anyhow::Result<(Arc<dyn Store>, Blo
         blobs.delete_plant(plant).await?;
     }
     store.forget_deleted_plants(Timestamp::now() - STALE_UPLOADS).await?;
-    Ok((Arc::new(store), blobs))
+    Ok((store, blobs))
 }
 
 /// A worker that runs the pipeline.

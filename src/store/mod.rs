@@ -5,6 +5,7 @@
 
 pub mod access;
 pub mod blobs;
+pub mod postgres;
 pub mod records;
 pub mod secret;
 pub mod sqlite;
@@ -15,6 +16,7 @@ mod sql;
 
 pub use access::{AccessStore, ApiKey, AuditEntry, KeyId, NewKey, Organisation, OrganisationId, Scope, SecretRecord};
 pub use blobs::{Blobs, Digest, StagedFile};
+pub use postgres::PostgresStore;
 pub use records::{
     Cancelled, Checkpoint, Claim, Completed, Created, Ending, Enqueued, Feature, FeatureQuery, FileRecord, FileWritten,
     GeoBox, Heartbeat, Job, JobId, JobRequest, JobState, LayerInfo, Model, NewFeature, NewLayer, NewModel, Page, Plant,
@@ -59,8 +61,8 @@ impl StoreError {
         let full = |error: &std::io::Error| error.kind() == std::io::ErrorKind::StorageFull;
         match self {
             Self::Io { source, .. } => full(source),
-            // SQLITE_FULL
-            Self::Database(sqlx::Error::Database(error)) => error.code().as_deref() == Some("13"),
+            // SQLITE_FULL, and Postgres' disk_full.
+            Self::Database(sqlx::Error::Database(error)) => matches!(error.code().as_deref(), Some("13" | "53100")),
             _ => false,
         }
     }

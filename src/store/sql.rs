@@ -172,7 +172,8 @@ pub const MADE_PROGRESS: &str =
 pub const CHECKPOINT: &str = "\
     INSERT INTO checkpoints (job_id, name, fingerprint, document) VALUES ($1, $2, $3, $4) \
     ON CONFLICT (job_id, name) DO UPDATE SET fingerprint = excluded.fingerprint, document = excluded.document";
-pub const CHECKPOINTS: &str = "SELECT name, document FROM checkpoints WHERE job_id = $1 AND fingerprint = $2";
+pub const CHECKPOINTS: &str =
+    "SELECT name, document FROM checkpoints WHERE job_id = $1 AND fingerprint = $2 ORDER BY name";
 /// What ended jobs had found is in their models, or of no use.
 pub const SWEEP_CHECKPOINTS: &str = "\
     DELETE FROM checkpoints WHERE NOT EXISTS (SELECT 1 FROM jobs WHERE jobs.id = checkpoints.job_id \

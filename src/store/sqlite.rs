@@ -46,6 +46,11 @@ impl SqliteStore {
     async fn begin(&self) -> Result<Tx, StoreError> {
         Ok(self.write.begin_with("BEGIN IMMEDIATE").await?)
     }
+
+    /// A transaction that looks at the whole queue: no other runs beside it.
+    async fn begin_alone(&self) -> Result<Tx, StoreError> {
+        self.begin().await
+    }
 }
 
 /// Brings the schema up to date, one process at a time: a server and its workers may start together.

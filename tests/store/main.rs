@@ -2,10 +2,10 @@
 
 mod conformance;
 
-use heliomap::store::SqliteStore;
+use heliomap::store::{PostgresStore, SqliteStore};
 
-/// Runs the whole suite on a store of its own per test.
-macro_rules! on_sqlite {
+/// Runs the whole suite on every database, on a store of its own per test.
+macro_rules! on_both {
     ($($name:ident),* $(,)?) => {
         mod sqlite {
             $(
@@ -17,10 +17,30 @@ macro_rules! on_sqlite {
                 }
             )*
         }
+
+        mod postgres {
+            $(
+                #[tokio::test]
+                async fn $name() {
+                    super::conformance::$name(&super::postgres_store().await).await;
+                }
+            )*
+        }
     };
 }
 
-on_sqlite!(
+/// A store in a new database of the server that `tests/with-postgres.sh` started for the tests.
+async fn postgres_store() -> PostgresStore {
+    let server = std::env::var("HELIOMAP_TEST_POSTGRES")
+        .expect("tests need a Postgres server: run `make unit`, or tests/with-postgres.sh before cargo test");
+    let name = format!("test_{}", uuid::Uuid::new_v4().simple());
+    let pool = sqlx::PgPool::connect(&format!("{server}/postgres")).await.unwrap();
+    sqlx::query(sqlx::AssertSqlSafe(format!("CREATE DATABASE {name}"))).execute(&pool).await.unwrap();
+    pool.close().await;
+    PostgresStore::open(&format!("{server}/{name}")).await.unwrap()
+}
+
+on_both!(
     organisations_and_their_plants,
     keys,
     audit_log,

@@ -169,7 +169,7 @@ impl Store for Rows {
     }
 
     async fn enqueue_job(&self, request: &JobRequest, now: Timestamp) -> Result<Enqueued, StoreError> {
-        let mut tx = self.begin().await?;
+        let mut tx = self.begin_alone().await?;
         let row = sqlx::query(sql::ENQUEUE_JOB)
             .bind(Uuid::new_v4().to_string())
             .bind(request.plant.to_string())
@@ -229,7 +229,7 @@ impl Store for Rows {
     }
 
     async fn claim_job(&self, worker: &str, lease: Duration, now: Timestamp) -> Result<Option<Claim>, StoreError> {
-        let mut tx = self.begin().await?;
+        let mut tx = self.begin_alone().await?;
         let buried = sqlx::query(sql::BURY_ABANDONED_JOBS)
             .bind(now.as_millisecond())
             .bind("every worker that took this job fell silent; see the workers' logs, then start a new job")

@@ -1,0 +1,48 @@
+//! The rows in a Postgres database, which servers and workers on any number of machines share.
+
+#[path = "backend/mod.rs"]
+mod backend;
+
+use super::StoreError;
+use sqlx::postgres::{PgPool, PgPoolOptions};
+use sqlx::{Postgres, Transaction};
+use std::time::Duration;
+
+use PostgresStore as Rows;
+use sqlx::postgres::PgRow as Row;
+type Tx = Transaction<'static, Postgres>;
+
+/// How long a statement waits for a connection.
+const ACQUIRE_TIMEOUT: Duration = Duration::from_secs(20);
+/// Most connections of one process.
+const MAX_CONNECTIONS: u32 = 10;
+/// The lock under which jobs are queued and claimed: any number, as long as nothing else in the database takes it.
+const QUEUE_LOCK: i64 = 0x6865_6c69_6f6d_6170;
+
+/// The rows in a Postgres database.
+#[derive(Debug, Clone)]
+pub struct PostgresStore {
+    read: PgPool,
+    write: PgPool,
+}
+
+impl PostgresStore {
+    /// Opens the database at a URL and brings its schema up to date, one process at a time.
+    pub async fn open(url: &str) -> Result<Self, StoreError> {
+        let options = PgPoolOptions::new().max_connections(MAX_CONNECTIONS).acquire_timeout(ACQUIRE_TIMEOUT);
+        let pool = options.connect(url).await?;
+        sqlx::migrate!("migrations/postgres").run(&pool).await?;
+        Ok(Self { read: pool.clone(), write: pool })
+    }
+
+    async fn begin(&self) -> Result<Tx, StoreError> {
+        Ok(self.write.begin().await?)
+    }
+
+    /// A transaction that looks at the whole queue: no other runs beside it.
+    async fn begin_alone(&self) -> Result<Tx, StoreError> {
+        let mut tx = self.begin().await?;
+        sqlx::query("SELECT pg_advisory_xact_lock($1)").bind(QUEUE_LOCK).execute(&mut *tx).await?;
+        Ok(tx)
+    }
+}

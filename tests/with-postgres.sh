@@ -1,0 +1,34 @@
+#!/usr/bin/env bash
+# Runs a command beside a Postgres server of its own, which HELIOMAP_TEST_POSTGRES names and which ends with the command:
+#   tests/with-postgres.sh cargo test
+# Installs Postgres by apt where there is none and the user may.
+set -euo pipefail
+
+programs() { command -v initdb || ls -d /usr/lib/postgresql/*/bin/initdb 2>/dev/null | sort -V | tail -1; }
+if [ -z "$(programs)" ]; then
+    echo "installing Postgres" >&2
+    apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -qq --yes --no-install-recommends postgresql >/dev/null
+fi
+bin=$(dirname "$(readlink -f "$(programs)")")
+
+# Postgres refuses to run as root.
+as_user=()
+if [ "$(id -u)" = 0 ]; then
+    as_user=(setpriv --reuid=postgres --regid=postgres --clear-groups)
+fi
+folder=$(mktemp -d /tmp/heliomap-postgres-XXXXXX)
+[ "$(id -u)" = 0 ] && chown postgres "$folder"
+port=$(python3 -c 'import socket; s = socket.socket(); s.bind(("127.0.0.1", 0)); print(s.getsockname()[1])')
+finish() {
+    "${as_user[@]}" "$bin/pg_ctl" --pgdata="$folder/data" --mode=immediate --silent stop >/dev/null 2>&1 || true
+    rm -rf "$folder"
+}
+trap finish EXIT
+cd_back=$PWD
+cd "$folder"
+"${as_user[@]}" "$bin/initdb" --pgdata="$folder/data" --username=heliomap --auth=trust --no-sync >"$folder/log" 2>&1 || { cat "$folder/log" >&2; exit 1; }
+"${as_user[@]}" "$bin/pg_ctl" --pgdata="$folder/data" --log="$folder/data/server.log" --silent --wait \
+    --options="-c listen_addresses=127.0.0.1 -c port=$port -c unix_socket_directories=$folder -c max_connections=300" start >/dev/null
+cd "$cd_back"
+export HELIOMAP_TEST_POSTGRES="postgres://heliomap@127.0.0.1:$port"
+"$@"
