@@ -1,5 +1,7 @@
 //! Layout, fusion and refinement on simulated plants: what comes out must be the plant that went in.
 
+mod contract;
+
 use heliomap::detection::ImageDetections;
 use heliomap::fusion::{self, Fused, FusionOptions, View};
 use heliomap::layout::{self, Layout, LayoutOptions};
@@ -11,6 +13,7 @@ use heliomap::simulator::{
 };
 use rand::SeedableRng;
 use rand::rngs::StdRng;
+use rayon::prelude::*;
 use std::collections::BTreeMap;
 
 /// A simulated plant, mapped.
@@ -111,19 +114,16 @@ fn plant(kind: Option<LayoutKind>, seed: u64) -> PlantSpec {
 }
 
 /// How many of the seeds come out exactly, and how many of the others are told of by no doubt.
-fn survey(name: &str, seeds: u64, make: impl Fn(u64) -> Simulation) -> (usize, usize) {
-    let (mut exact, mut silent) = (0, 0);
-    for seed in 0..seeds {
-        let mapped = Mapped::new(make(seed));
-        let report = mapped.report();
-        if report.false_modules.is_empty()
-            && report.wrong_structure.is_empty()
-            && report.missing.len() <= mapped.never_seen()
-        {
-            exact += 1;
-        } else {
-            silent += usize::from(mapped.fused.doubts.is_empty());
-            println!(
+fn survey(name: &str, seeds: u64, make: impl Fn(u64) -> Simulation + Sync) -> (usize, usize) {
+    let outcomes: Vec<(bool, bool, String)> = (0..seeds)
+        .into_par_iter()
+        .map(|seed| {
+            let mapped = Mapped::new(make(seed));
+            let report = mapped.report();
+            let exact = report.false_modules.is_empty()
+                && report.wrong_structure.is_empty()
+                && report.missing.len() <= mapped.never_seen();
+            let told = format!(
                 "{name} seed {seed}: {} missing ({} never seen), {} false, {} wrong ({:?}), {} doubts",
                 report.missing.len(),
                 mapped.never_seen(),
@@ -132,8 +132,14 @@ fn survey(name: &str, seeds: u64, make: impl Fn(u64) -> Simulation) -> (usize, u
                 report.wrong_structure.first(),
                 mapped.fused.doubts.len(),
             );
-        }
+            (exact, !exact && mapped.fused.doubts.is_empty(), told)
+        })
+        .collect();
+    for (_, _, told) in outcomes.iter().filter(|(exact, _, _)| !exact) {
+        println!("{told}");
     }
+    let exact = outcomes.iter().filter(|(exact, _, _)| *exact).count();
+    let silent = outcomes.iter().filter(|(_, silent, _)| *silent).count();
     println!("{name}: {exact} of {seeds} exact, {silent} wrong without a doubt");
     (exact, silent)
 }
@@ -280,16 +286,5 @@ fn the_order_of_the_images_does_not_matter() {
     assert_eq!(labels(&one), labels(&other));
     for (a, b) in one.modules.iter().zip(&other.modules) {
         assert!((a.center_enu_m - b.center_enu_m).norm() < 1e-3, "{}", a.label);
-    }
-}
-
-#[test]
-#[ignore = "a survey of every kind of layout; run it with `make structure`"]
-fn every_kind_of_layout() {
-    for kind in LayoutKind::ALL {
-        survey(&format!("{kind:?}"), 20, |seed| {
-            let flight = Flight::random(&mut StdRng::seed_from_u64(seed ^ 0x55));
-            simulate(&plant(Some(kind), seed), &flight, &Errors::paper(), seed)
-        });
     }
 }
