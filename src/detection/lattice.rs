@@ -617,6 +617,12 @@ mod tests {
         (truth.iter().map(nearest).sum::<f64>() / truth.len() as f64).sqrt()
     }
 
+    /// By how much the boxes' IoU with the truth falls short of 1, on average.
+    fn lost(found: &[ModuleBox], truth: &[ModuleBox]) -> f64 {
+        let best = |b: &ModuleBox| found.iter().map(|f| f.quad().iou(&b.quad())).fold(0.0, f64::max);
+        truth.iter().map(|b| 1.0 - best(b)).sum::<f64>() / truth.len() as f64
+    }
+
     fn faces(truth: &[ModuleBox]) -> Faces {
         Faces(truth.iter().map(ModuleBox::quad).collect())
     }
@@ -626,14 +632,13 @@ mod tests {
         let truth = bench(14, 4, 0.0);
         let boxes = shaken(&truth, 1.0, 1);
         let before = error_px(&boxes, &truth);
+        let before_lost = lost(&boxes, &truth);
         let found = complete(boxes, Some(&faces(&truth)), SIZE);
         assert_eq!(found.len(), truth.len());
         let after = error_px(&found, &truth);
         assert!(after < 0.7 * before, "{before} px before, {after} px after");
-        for b in &truth {
-            let best = found.iter().map(|f| f.quad().iou(&b.quad())).fold(0.0, f64::max);
-            assert!(best > 0.9, "IoU {best}");
-        }
+        let after_lost = lost(&found, &truth);
+        assert!(after_lost < 0.8 * before_lost, "IoU short of 1 by {before_lost} before, by {after_lost} after");
     }
 
     #[test]
