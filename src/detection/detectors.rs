@@ -2,7 +2,7 @@
 
 use super::mask_to_boxes::ModuleBox;
 use super::merge::merge;
-use super::{Detection, DetectionError, Detector, Unet, Yolo, filter, lattice};
+use super::{Detection, DetectionError, Detector, Unet, Yolo, filter, lattice, registration};
 use crate::geometry::Quad;
 use image::RgbImage;
 use nalgebra::Vector2;
@@ -51,7 +51,8 @@ pub(super) fn detect(
     let foundation = lattice::complete(foundation, evidence, size);
     let complement = lattice::complete(complement, None, size);
     let shows = |b: &ModuleBox| evidence.is_none_or(|evidence| lattice::face(b, evidence) > TRACE);
-    let boxes = filter::supported(merge(foundation, complement, shows));
+    let mut boxes = filter::supported(merge(foundation, complement, shows));
+    registration::register(&mut boxes, image)?;
     Ok(boxes.iter().filter_map(detection).filter(|d| filter::is_inside_frame(&d.quad.corners, width, height)).collect())
 }
 

@@ -199,6 +199,12 @@ struct Step {
     px: Vector2<f64>,
 }
 
+/// Indices of boxes by column and row of the lattices that they form, in order; columns run along the longer extent.
+pub(super) fn grouped(boxes: &[ModuleBox]) -> Vec<Vec<((i32, i32), usize)>> {
+    let seen: Vec<Seen> = boxes.iter().map(|b| Seen { b: *b, is_added: false }).collect();
+    lattices(&seen).iter().map(Lattice::sorted).collect()
+}
+
 /// Groups of linked boxes, each with columns along its longer extent.
 fn lattices(seen: &[Seen]) -> Vec<Lattice> {
     let links = links(seen);
@@ -553,7 +559,7 @@ fn is_inside(quad: &Quad, size: Vector2<f64>) -> bool {
     quad.corners.iter().all(|c| c.x >= -0.5 && c.y >= -0.5 && c.x <= size.x - 0.5 && c.y <= size.y - 0.5)
 }
 
-fn median(values: &mut [f64]) -> f64 {
+pub(super) fn median(values: &mut [f64]) -> f64 {
     if values.is_empty() {
         return 0.0;
     }

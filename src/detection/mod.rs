@@ -13,6 +13,7 @@ mod merge;
 mod neighbours;
 mod open;
 pub mod probability;
+mod registration;
 pub mod runtime;
 pub mod scale;
 mod tiles;
