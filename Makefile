@@ -53,7 +53,7 @@ unit: setup ## Tests alone
 
 KILLS ?= 200
 kills: setup ## Kill server and worker at random (KILLS times): nothing is lost, models are those of a run without kills
-	$(CARGO) build --locked
+	$(CARGO) test --locked --no-run
 	$(PYTHON) tests/kills/kills.py --binary target/debug/heliomap --kills $(KILLS)
 
 tus: setup .venv/tus/done tests/tus/node_modules/done ## Upload 1 GB by two tus clients through 20 disconnects and a kill: the bytes agree
