@@ -37,6 +37,7 @@ async fn open_storage(args: &StorageArgs) -> anyhow::Result<(Arc<dyn Store>, Blo
         None => Arc::new(SqliteStore::open(&folder.join("heliomap.db")).await.with_context(hint)?),
     };
     store.delete_expired_uploads(Timestamp::now()).await?;
+    store.forget_old_requests(Timestamp::now()).await?;
     blobs.sweep_uploads(store.uploads().await?.into_iter().collect(), STALE_UPLOADS).await.with_context(hint)?;
     // A plant may have been deleted without its blobs, or while some were still coming.
     for plant in store.deleted_plants().await? {

@@ -36,6 +36,7 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
             limits: Arc::new(args.limits),
             bell,
             desk: Arc::default(),
+            decoding: http::decoders(),
             stop: stop.clone(),
             insecure: args.insecure,
         });

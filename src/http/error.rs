@@ -54,6 +54,7 @@ codes! {
     SurveyIncomplete = CONFLICT, "survey_incomplete", "The survey cannot be mapped yet";
     JobFinished = CONFLICT, "job_finished", "The job has ended";
     JobStopping = CONFLICT, "job_stopping", "The survey's cancelled job has not stopped yet";
+    IdempotencyBusy = CONFLICT, "idempotency_busy", "The request is being answered";
     UploadOffset = CONFLICT, "upload_offset", "The bytes do not go on where the upload is";
     TusVersion = PRECONDITION_FAILED, "tus_version", "The protocol's version is missing or another";
     UploadBusy = LOCKED, "upload_busy", "The upload is in other hands";
@@ -63,6 +64,7 @@ codes! {
     UnsupportedMediaType = UNSUPPORTED_MEDIA_TYPE, "unsupported_media_type", "The body's media type does not apply here";
     UnsupportedArchive = UNSUPPORTED_MEDIA_TYPE, "unsupported_archive", "The body is no zip or tar";
     ChecksumMismatch = UNPROCESSABLE_ENTITY, "checksum_mismatch", "The bytes came changed";
+    IdempotencyKeyReused = UNPROCESSABLE_ENTITY, "idempotency_key_reused", "The key belongs to another request";
     InvalidName = UNPROCESSABLE_ENTITY, "invalid_name", "The name cannot be used";
     InvalidFields = UNPROCESSABLE_ENTITY, "invalid_fields", "The document has the wrong fields";
     UnknownFile = UNPROCESSABLE_ENTITY, "unknown_file", "The file is no part of a reconstruction";

@@ -10,6 +10,8 @@ mod extract;
 mod features;
 mod guard;
 mod health;
+mod idempotency;
+mod images;
 mod intake;
 mod jobs;
 mod keys;
@@ -22,5 +24,5 @@ mod tus;
 mod uploads;
 
 pub use router::{openapi, router};
-pub use state::AppState;
+pub use state::{AppState, decoders};
 pub use tus::Desk;

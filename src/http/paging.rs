@@ -29,11 +29,7 @@ impl PageQuery {
     }
 
     fn limit(&self) -> Result<u32, ApiError> {
-        let limit = self.limit.unwrap_or(DEFAULT_LIMIT);
-        match limit {
-            1..=MAX_LIMIT => Ok(limit),
-            _ => Err(ApiError::new(Code::InvalidQuery, format!("limit is {limit}; it must be 1 to {MAX_LIMIT}"))),
-        }
+        list_limit(self.limit)
     }
 
     /// The part of a list from the rows asked for; `seq` is a row's sequence number.
@@ -50,6 +46,14 @@ impl PageQuery {
         let items = rows.into_iter().take(limit as usize).inspect(|row| last = Some(seq(row))).map(view).collect();
         let next = last.filter(|_| more).map(|last| format!("{path}?limit={limit}&cursor={last}"));
         Ok(List { items, next })
+    }
+}
+
+/// How many items a part has at most, by what was asked for.
+pub fn list_limit(asked: Option<u32>) -> Result<u32, ApiError> {
+    match asked.unwrap_or(DEFAULT_LIMIT) {
+        limit @ 1..=MAX_LIMIT => Ok(limit),
+        limit => Err(ApiError::new(Code::InvalidQuery, format!("limit is {limit}; it must be 1 to {MAX_LIMIT}"))),
     }
 }
 

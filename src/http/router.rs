@@ -2,7 +2,8 @@
 
 use super::guard::{Gate, Policy};
 use super::{
-    AppState, docs, error, events, features, guard, health, jobs, keys, models, page, plants, surveys, tus, uploads,
+    AppState, docs, error, events, features, guard, health, idempotency, images, jobs, keys, models, page, plants,
+    surveys, tus, uploads,
 };
 use axum::Router;
 use axum::body::Body;
@@ -55,6 +56,8 @@ fn prompt() -> OpenApiRouter<AppState> {
         .routes(routes!(plants::get, plants::delete))
         .routes(routes!(surveys::create, surveys::list))
         .routes(routes!(surveys::get))
+        .routes(routes!(images::list))
+        .routes(routes!(images::positions))
         .routes(routes!(jobs::start, jobs::list_of_survey))
         .routes(routes!(jobs::list))
         .routes(routes!(jobs::get))
@@ -90,6 +93,7 @@ pub fn openapi() -> utoipa::openapi::OpenApi {
     let mut description =
         OpenApiRouter::with_openapi(Description::openapi()).merge(prompt()).merge(uploads()).into_openapi();
     guard::describe(&mut description);
+    idempotency::describe(&mut description);
     description
 }
 
@@ -101,6 +105,7 @@ pub fn router(state: AppState) -> Router {
     let (router, description) = OpenApiRouter::new().merge(prompt).merge(uploads).split_for_parts();
     let gate = Gate { state: state.clone(), policy: Arc::new(Policy::of(&description)) };
     router
+        .route_layer(middleware::from_fn_with_state(state.clone(), idempotency::once))
         .route_layer(middleware::from_fn_with_state(gate, guard::guard))
         .fallback(page::serve)
         .method_not_allowed_fallback(|| async { StatusCode::METHOD_NOT_ALLOWED })

@@ -6,7 +6,7 @@ use crate::config::Limits;
 use crate::plant::PlantId;
 use crate::store::{Blobs, Plant, Store, Survey, SurveyId};
 use std::sync::Arc;
-use tokio::sync::Notify;
+use tokio::sync::{Notify, Semaphore};
 use tokio_util::sync::CancellationToken;
 
 /// What every handler may use.
@@ -16,12 +16,20 @@ pub struct AppState {
     pub blobs: Blobs,
     pub limits: Arc<Limits>,
     pub desk: Arc<Desk>,
+    /// One permit for each photo that may be decoded at once.
+    pub decoding: Arc<Semaphore>,
     /// Rung when a job was queued.
     pub bell: Arc<Notify>,
     /// Raised when the service stops: answers without an end end then.
     pub stop: CancellationToken,
     /// Whether anyone may do anything, without a key.
     pub insecure: bool,
+}
+
+/// How many photos may be decoded at once: half of the cores answer requests.
+pub fn decoders() -> Arc<Semaphore> {
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    Arc::new(Semaphore::new((cores / 2).max(1)))
 }
 
 impl AppState {

@@ -3,6 +3,7 @@
 use super::AppState;
 use super::error::{ApiError, Problem};
 use super::extract::{ApiJson, ApiPath, ApiQuery};
+use super::images::{self, FileView, ImagesSummary};
 use super::paging::{List, PageQuery};
 use super::plants::{checked_name, created_answer};
 use crate::jobs;
@@ -50,6 +51,8 @@ pub struct SurveyDetail {
     pub complete: bool,
     /// What is missing before it can be mapped.
     pub missing: Vec<MissingView>,
+    /// How photos and reconstruction go together.
+    pub images: ImagesSummary,
     /// Sorted by path.
     pub files: Vec<FileView>,
 }
@@ -57,7 +60,8 @@ pub struct SurveyDetail {
 /// Something that a survey lacks.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 pub struct MissingView {
-    /// `too_few_images`, `no_reconstruction` or `no_reference`.
+    /// `too_few_images`, `no_reconstruction`, `no_reference` or `images_not_uploaded`.
+    #[schema(example = "no_reconstruction")]
     pub code: &'static str,
     /// What is missing and what to do.
     pub message: String,
@@ -67,41 +71,6 @@ pub struct MissingView {
 pub fn missing_views(files: &[FileRecord]) -> Vec<MissingView> {
     let view = |missing: jobs::Missing| MissingView { code: missing.code, message: missing.message };
     jobs::missing(files).into_iter().map(view).collect()
-}
-
-/// A file of a survey.
-#[derive(Debug, Serialize, utoipa::ToSchema)]
-pub struct FileView {
-    /// Its place in the survey's folder.
-    #[schema(example = "images/DJI_0001.jpg")]
-    pub path: String,
-    /// `image` or `reconstruction`.
-    pub kind: &'static str,
-    /// Bytes.
-    pub size: u64,
-    /// SHA-256 of its bytes, hexadecimal.
-    #[schema(min_length = 64, max_length = 64)]
-    pub sha256: String,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub width_px: Option<u32>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub height_px: Option<u32>,
-    #[schema(value_type = String, format = DateTime)]
-    pub stored: Timestamp,
-}
-
-impl From<FileRecord> for FileView {
-    fn from(file: FileRecord) -> Self {
-        Self {
-            path: file.path.to_string(),
-            kind: file.path.kind().as_str(),
-            size: file.size,
-            sha256: file.sha256.to_string(),
-            width_px: file.size_px.map(|size| size[0]),
-            height_px: file.size_px.map(|size| size[1]),
-            stored: file.stored,
-        }
-    }
 }
 
 /// Create a survey of a plant, or find the one of that name
@@ -181,10 +150,6 @@ pub async fn get(
     let survey = state.require_survey(plant, survey).await?;
     let files = state.store.files(survey.id).await?;
     let missing = missing_views(&files);
-    Ok(Json(SurveyDetail {
-        complete: missing.is_empty(),
-        missing,
-        survey: survey.into(),
-        files: files.into_iter().map(FileView::from).collect(),
-    }))
+    let (images, files) = images::summary(files);
+    Ok(Json(SurveyDetail { survey: survey.into(), complete: missing.is_empty(), missing, images, files }))
 }

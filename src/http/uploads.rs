@@ -6,12 +6,12 @@
 use super::AppState;
 use super::error::{ApiError, Code, Problem};
 use super::extract::ApiPath;
-use super::intake;
+use super::images::FileView;
 use super::intake::archive::{self, ArchiveError, Unpacked};
 use super::intake::receive::{Bounds, drain, receive};
-use super::surveys::FileView;
+use super::intake::{self, Stored};
 use crate::plant::PlantId;
-use crate::store::{Content, FileRecord, FileWritten, ImageName, StagedFile, StoreError, SurveyId, SurveyPath};
+use crate::store::{Content, FileWritten, ImageName, StagedFile, StoreError, SurveyId, SurveyPath};
 use axum::Json;
 use axum::body::{Body, BodyDataStream};
 use axum::extract::multipart::MultipartRejection;
@@ -46,13 +46,13 @@ pub struct UploadedArchive {
 }
 
 /// A file that was stored, as it is told.
-pub fn uploaded((record, written): (FileRecord, FileWritten)) -> UploadedFile {
-    let result = match written {
+pub fn uploaded(stored: Stored) -> UploadedFile {
+    let result = match stored.written {
         FileWritten::Created => "created",
         FileWritten::Replaced => "replaced",
         FileWritten::Unchanged => "unchanged",
     };
-    UploadedFile { result, file: record.into() }
+    UploadedFile { result, file: FileView::new(stored.record, &stored.twins) }
 }
 
 /// Upload one photo
@@ -147,7 +147,7 @@ async fn put_one(
     };
     match stored.await {
         Ok(stored) => {
-            let new = stored.iter().any(|(_, written)| *written == FileWritten::Created);
+            let new = stored.iter().any(|stored| stored.written == FileWritten::Created);
             let status = if new { StatusCode::CREATED } else { StatusCode::OK };
             let file = stored.into_iter().next().map(uploaded);
             Ok((status, Json(file)).into_response())

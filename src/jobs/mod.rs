@@ -10,7 +10,7 @@ mod rows;
 mod watch;
 
 pub use mapper::{Mapper, PipelineMapper};
-pub use readiness::{Missing, missing};
+pub use readiness::{Missing, RECONSTRUCTIONS, is_shot, missing, shots, shots_without_image};
 pub use worker::{Worker, WorkerSettings};
 
 use crate::pipeline::MapError;

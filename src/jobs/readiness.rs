@@ -3,6 +3,12 @@
 use crate::store::{Content, FileRecord};
 use std::collections::BTreeSet;
 
+/// Where a survey's reconstruction may be; the first that is there counts.
+pub const RECONSTRUCTIONS: [&str; 2] = ["reconstruction.json", "undistorted/reconstruction.json"];
+
+/// What OpenSfM may append to the name of an undistorted image.
+const SUFFIXES: [&str; 4] = ["", ".jpg", ".tif", ".png"];
+
 /// Something that a survey lacks.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Missing {
@@ -27,7 +33,7 @@ pub fn missing(files: &[FileRecord]) -> Vec<Missing> {
             ),
         });
     }
-    if !has("reconstruction.json") && !has("undistorted/reconstruction.json") {
+    if !RECONSTRUCTIONS.into_iter().any(has) {
         missing.push(Missing {
             code: "no_reconstruction",
             message: "reconstruction.json is missing: run OpenSfM on the photos, then PUT …/reconstruction with its \
@@ -43,5 +49,39 @@ pub fn missing(files: &[FileRecord]) -> Vec<Missing> {
                 .to_owned(),
         });
     }
+    let absent = shots_without_image(files);
+    if let Some(first) = absent.first() {
+        missing.push(Missing {
+            code: "images_not_uploaded",
+            message: format!(
+                "the reconstruction was made from {} image(s) that were not uploaded, {first} among them: PUT …/images/NAME \
+                 for each",
+                absent.len()
+            ),
+        });
+    }
     missing
+}
+
+/// The images from which a survey's reconstruction was made; `None` where there is no reconstruction, or none that could be
+/// read.
+pub fn shots(files: &[FileRecord]) -> Option<&[String]> {
+    let reconstruction = RECONSTRUCTIONS.iter().find_map(|path| files.iter().find(|file| file.path.as_str() == *path));
+    reconstruction?.shots.as_deref()
+}
+
+/// Whether a reconstruction was made from an image.
+pub fn is_shot(shots: &BTreeSet<String>, image: &str) -> bool {
+    SUFFIXES.iter().any(|suffix| shots.contains(&format!("{image}{suffix}")))
+}
+
+/// The images from which a survey's reconstruction was made and of which neither the photo nor the undistorted image is
+/// there.
+pub fn shots_without_image(files: &[FileRecord]) -> Vec<String> {
+    let paths: BTreeSet<&str> = files.iter().map(|file| file.path.as_str()).collect();
+    let is_there = |shot: &str| {
+        paths.contains(format!("images/{shot}").as_str())
+            || SUFFIXES.iter().any(|suffix| paths.contains(format!("undistorted/images/{shot}{suffix}").as_str()))
+    };
+    shots(files).unwrap_or_default().iter().filter(|shot| !is_there(shot)).cloned().collect()
 }

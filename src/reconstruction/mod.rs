@@ -1,15 +1,17 @@
 //! What structure from motion gives us, as one type, with one reader per producer.
 
 pub mod error;
+pub mod exif;
 mod jpeg;
 pub mod opensfm;
 pub mod photo;
 pub mod ply;
+pub mod quality;
 
 use crate::geometry::{Camera, GeodeticReference, PointCloud, Pose};
 pub use error::ReconstructionError;
 use nalgebra::Vector3;
-pub use photo::{Photo, PhotoError};
+pub use photo::{Photo, PhotoError, PhotoFacts};
 
 /// One photo: its camera and its pose. Pixels are those of the undistorted image.
 #[derive(Debug, Clone)]

@@ -1,11 +1,15 @@
 //! Photos: checked by their header before anything is decoded, decoded whole or refused, undistorted where the file is
 //! as the lens drew it.
 
+use super::exif::{self, Exposure};
 use super::jpeg::{self, JpegError};
+use super::quality::{MEASURED_PX, Quality};
 use crate::geometry::Camera;
-use image::{DynamicImage, ImageError, ImageFormat, ImageReader, RgbImage};
+use fast_image_resize as fir;
+use image::{DynamicImage, GrayImage, ImageError, ImageFormat, ImageReader, RgbImage};
 use nalgebra::Vector2;
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
@@ -183,6 +187,33 @@ pub fn inspect_whole(path: &Path, name: &str, max_pixels: u64) -> Result<PhotoHe
         decode(path, name, header.format)?;
     }
     Ok(header)
+}
+
+/// What a photo tells of itself, and how good it is.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PhotoFacts {
+    #[serde(flatten)]
+    pub exposure: Exposure,
+    pub quality: Quality,
+}
+
+/// Decodes a photo that [`inspect`] let through, and measures it.
+///
+/// # Errors
+/// Data that does not decode.
+pub fn examine(path: &Path, name: &str, header: PhotoHeader) -> Result<PhotoFacts, PhotoError> {
+    let mut picture = decode(path, name, header.format)?.into_luma8();
+    let shrink = f64::from(MEASURED_PX) / f64::from(picture.width().max(picture.height()));
+    if shrink < 1.0 {
+        let size = |pixels: u32| ((f64::from(pixels) * shrink).round() as u32).max(1);
+        let mut shrunk = GrayImage::new(size(picture.width()), size(picture.height()));
+        let options = fir::ResizeOptions::new().resize_alg(fir::ResizeAlg::Convolution(fir::FilterType::Box));
+        fir::Resizer::new()
+            .resize(&picture, &mut shrunk, Some(&options))
+            .map_err(|error| PhotoError::NotAnImage { name: name.to_owned(), what: error.to_string() })?;
+        picture = shrunk;
+    }
+    Ok(PhotoFacts { exposure: exif::read(path), quality: Quality::measure(&picture) })
 }
 
 fn decode(path: &Path, name: &str, format: ImageFormat) -> Result<DynamicImage, PhotoError> {

@@ -7,6 +7,7 @@ pub mod access;
 pub mod blobs;
 pub mod postgres;
 pub mod records;
+pub mod requests;
 pub mod secret;
 pub mod sqlite;
 pub mod survey_path;
@@ -22,6 +23,7 @@ pub use records::{
     GeoBox, Heartbeat, Job, JobId, JobRequest, JobState, LayerInfo, Model, NewFeature, NewLayer, NewModel, Page, Plant,
     Progress, Survey, SurveyId,
 };
+pub use requests::RequestStore;
 pub use secret::Secret;
 pub use sqlite::SqliteStore;
 pub use survey_path::{Content, FileKind, ImageName, InvalidPath, SurveyPath};
@@ -70,7 +72,7 @@ impl StoreError {
 
 /// The rows. Absence is `Ok(None)`; the time comes in from the caller.
 #[async_trait::async_trait]
-pub trait Store: AccessStore + UploadStore {
+pub trait Store: AccessStore + UploadStore + RequestStore {
     /// Fails where the database does not answer.
     async fn ping(&self) -> Result<(), StoreError>;
 
@@ -109,6 +111,23 @@ pub trait Store: AccessStore + UploadStore {
     async fn put_files(&self, survey: SurveyId, files: &[FileRecord]) -> Result<Vec<FileWritten>, StoreError>;
     /// A survey's files, sorted by path.
     async fn files(&self, survey: SurveyId) -> Result<Vec<FileRecord>, StoreError>;
+
+    /// One file of a survey.
+    async fn file(&self, survey: SurveyId, path: &SurveyPath) -> Result<Option<FileRecord>, StoreError>;
+    /// A survey's photos sorted by path: at most `limit` after the one at a path.
+    async fn photos(
+        &self,
+        survey: SurveyId,
+        after: Option<&SurveyPath>,
+        limit: u32,
+    ) -> Result<Vec<FileRecord>, StoreError>;
+    /// Where a survey's photos with these bytes are, sorted, at most `limit`.
+    async fn photos_of_digest(
+        &self,
+        survey: SurveyId,
+        sha256: Digest,
+        limit: u32,
+    ) -> Result<Vec<SurveyPath>, StoreError>;
 
     /// Queues a mapping of a survey, or finds its unfinished job.
     async fn enqueue_job(&self, request: &JobRequest, now: Timestamp) -> Result<Enqueued, StoreError>;

@@ -4,6 +4,7 @@ use super::access::OrganisationId;
 use super::blobs::Digest;
 use super::survey_path::SurveyPath;
 use crate::plant::{Layer, PlantId, Warning};
+use crate::reconstruction::PhotoFacts;
 use jiff::Timestamp;
 use std::fmt;
 use std::str::FromStr;
@@ -78,6 +79,10 @@ pub struct FileRecord {
     pub sha256: Digest,
     /// Width and height in pixels, where it is an image.
     pub size_px: Option<[u32; 2]>,
+    /// What was found in it, where it is a photo.
+    pub photo: Option<PhotoFacts>,
+    /// The images that it names, sorted, where it is a reconstruction that could be read.
+    pub shots: Option<Vec<String>>,
     pub stored: Timestamp,
 }
 

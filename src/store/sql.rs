@@ -16,6 +16,11 @@ macro_rules! survey {
         "seq, id, plant_id, name, created_ms"
     };
 }
+macro_rules! file {
+    () => {
+        "path, size, sha256, width_px, height_px, photo, shots, stored_ms"
+    };
+}
 macro_rules! job {
     () => {
         "seq, id, plant_id, survey_id, state, options, priority, stage, done, total, remaining_ms, warnings, error_code, \
@@ -102,12 +107,23 @@ pub const SURVEYS: &str =
 
 pub const FILE_DIGEST: &str = "SELECT sha256 FROM files WHERE survey_id = $1 AND path = $2";
 pub const PUT_FILE: &str = "\
-    INSERT INTO files (survey_id, path, kind, size, sha256, width_px, height_px, stored_ms) \
-    VALUES ($1, $2, $3, $4, $5, $6, $7, $8) \
+    INSERT INTO files (survey_id, path, kind, size, sha256, width_px, height_px, photo, shots, stored_ms) \
+    VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10) \
     ON CONFLICT (survey_id, path) DO UPDATE SET kind = excluded.kind, size = excluded.size, sha256 = excluded.sha256, \
-    width_px = excluded.width_px, height_px = excluded.height_px, stored_ms = excluded.stored_ms";
-pub const FILES: &str = "\
-    SELECT path, size, sha256, width_px, height_px, stored_ms FROM files WHERE survey_id = $1 ORDER BY path";
+    width_px = excluded.width_px, height_px = excluded.height_px, photo = excluded.photo, shots = excluded.shots, \
+    stored_ms = excluded.stored_ms";
+/// What older versions did not look for.
+pub const COMPLETE_FILE: &str = "\
+    UPDATE files SET photo = $3, shots = $4 WHERE survey_id = $1 AND path = $2 AND photo IS NULL AND shots IS NULL";
+pub const FILES: &str = concat!("SELECT ", file!(), " FROM files WHERE survey_id = $1 ORDER BY path");
+pub const FILE: &str = concat!("SELECT ", file!(), " FROM files WHERE survey_id = $1 AND path = $2");
+pub const PHOTOS: &str = concat!(
+    "SELECT ",
+    file!(),
+    " FROM files WHERE survey_id = $1 AND kind = 'image' AND path > $2 ORDER BY path LIMIT $3"
+);
+pub const PHOTOS_OF_DIGEST: &str = "\
+    SELECT path FROM files WHERE survey_id = $1 AND sha256 = $2 AND kind = 'image' ORDER BY path LIMIT $3";
 
 pub const CREATE_UPLOAD: &str = "\
     INSERT INTO uploads (id, survey_id, length, received, partial, metadata, expires_ms) \
@@ -120,6 +136,19 @@ pub const END_UPLOAD: &str = "UPDATE uploads SET outcome = $2 WHERE id = $1";
 pub const DELETE_UPLOAD: &str = "DELETE FROM uploads WHERE survey_id = $1 AND id = $2";
 pub const DELETE_EXPIRED_UPLOADS: &str = "DELETE FROM uploads WHERE expires_ms <= $1";
 pub const UPLOADS: &str = "SELECT id FROM uploads";
+
+/// Takes a name that nobody has, or whose time is over.
+pub const BEGIN_REQUEST: &str = "\
+    INSERT INTO requests (organisation_id, name, expires_ms) VALUES ($1, $2, $4) \
+    ON CONFLICT (organisation_id, name) DO UPDATE SET fingerprint = NULL, status = NULL, headers = NULL, body = NULL, \
+    expires_ms = excluded.expires_ms WHERE requests.expires_ms <= $3";
+pub const REQUEST: &str =
+    "SELECT fingerprint, status, headers, body FROM requests WHERE organisation_id = $1 AND name = $2";
+pub const KEEP_ANSWER: &str = "\
+    UPDATE requests SET fingerprint = $3, status = $4, headers = $5, body = $6, expires_ms = $7 \
+    WHERE organisation_id = $1 AND name = $2";
+pub const FORGET_REQUEST: &str = "DELETE FROM requests WHERE organisation_id = $1 AND name = $2 AND status IS NULL";
+pub const FORGET_OLD_REQUESTS: &str = "DELETE FROM requests WHERE expires_ms <= $1";
 
 pub const ENQUEUE_JOB: &str = concat!(
     "INSERT INTO jobs (id, plant_id, survey_id, state, options, max_attempts, run_after_ms, created_ms, priority) \

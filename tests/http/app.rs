@@ -3,7 +3,7 @@
 use heliomap::config::Limits;
 use heliomap::detection::{Detector, ImageDetections};
 use heliomap::geometry::{GeodeticReference, Lla};
-use heliomap::http::{AppState, router};
+use heliomap::http::{AppState, decoders, router};
 use heliomap::jobs::{Mapper, PipelineMapper, Worker, WorkerSettings};
 use heliomap::pipeline::{Found, MapError, MapOptions, Observer, Stage, Subject};
 use heliomap::plant::{
@@ -267,6 +267,7 @@ impl App {
             limits: Arc::new(limits),
             bell,
             desk: Arc::default(),
+            decoding: decoders(),
             stop: stop.clone(),
             insecure,
         });

@@ -167,15 +167,14 @@ async fn images_and_reconstruction_that_do_not_belong_together() {
         let shots = shots(reconstruction);
         *shots = std::mem::take(shots).into_iter().map(|(name, shot)| (format!("June_{name}"), shot)).collect();
     });
-    fails(
-        &app,
-        &others,
-        "reconstruction_of_other_images",
-        &["reconstruction.json is of other images", "June_DJI_0001.jpg", "DJI_0001.jpg", "add the images"],
-    )
-    .await;
-    let files = Files::new().without("images/DJI_0003.jpg");
-    let survey = fails(&app, &files, "shot_without_image", &["reconstruction.json", "DJI_0003.jpg", "add them"]).await;
+    // Said before a job is begun.
+    let survey = others.upload(&app).await;
+    let refused = app.post(&format!("{survey}/jobs"), json!({})).await;
+    assert_problem(refused, 409, "survey_incomplete", "June_DJI_0001.jpg");
+    let survey = Files::new().without("images/DJI_0003.jpg").upload(&app).await;
+    let refused = app.post(&format!("{survey}/jobs"), json!({})).await;
+    assert_eq!(refused.1["missing"][0]["code"], "images_not_uploaded");
+    assert_problem(refused, 409, "survey_incomplete", "DJI_0003.jpg");
     // Done as told, the same survey maps.
     let (status, _) = app.put(&format!("{survey}/images/DJI_0003.jpg"), photo(3)).await;
     assert_eq!(status, StatusCode::CREATED);

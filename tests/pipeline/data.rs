@@ -1,9 +1,11 @@
 //! The larger data sets, where they are there: `HELIOMAP_DATA` names their folder.
 
 use crate::survey::{can_detect, heliomap};
+use heliomap::reconstruction::photo::{DEFAULT_MAX_PIXELS, examine, inspect};
+use rayon::prelude::*;
 use serde_json::Value;
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// The folder of a data set; says so where it is absent.
 fn data(name: &str) -> Option<PathBuf> {
@@ -15,12 +17,12 @@ fn data(name: &str) -> Option<PathBuf> {
     if folder.is_none() {
         eprintln!("skipped: the data set {name} is not there (HELIOMAP_DATA names the folder that holds it)");
     }
-    folder.filter(|_| can_detect())
+    folder
 }
 
 #[test]
 fn the_plant_at_full_resolution_is_right_to_a_centimetre_and_a_half() {
-    let Some(folder) = data("small") else { return };
+    let Some(folder) = data("small").filter(|_| can_detect()) else { return };
     let out = tempfile::tempdir().unwrap();
     let plant = out.path().join("plant.geojson");
     let said = heliomap(&["map", folder.to_str().unwrap(), "--out", plant.to_str().unwrap()]);
@@ -38,7 +40,7 @@ fn the_plant_at_full_resolution_is_right_to_a_centimetre_and_a_half() {
 
 #[test]
 fn a_real_plant_is_mapped_to_its_end_with_most_whole_benches_right() {
-    let Some(folder) = data("missouri-west") else { return };
+    let Some(folder) = data("missouri-west").filter(|_| can_detect()) else { return };
     let out = tempfile::tempdir().unwrap();
     let plant = out.path().join("plant.geojson");
     let said = heliomap(&["map", folder.to_str().unwrap(), "--out", plant.to_str().unwrap()]);
@@ -51,4 +53,35 @@ fn a_real_plant_is_mapped_to_its_end_with_most_whole_benches_right() {
     // Ten benches of 54 columns and 3 rows were counted; half of them is the least that must come out.
     let whole = benches.values().filter(|count| **count == 162).count();
     assert!(whole >= 5, "{whole} benches of 162 modules: {benches:?}");
+}
+
+/// Image files anywhere in a folder, every so many of them.
+fn images(folder: &Path, every: usize) -> Vec<PathBuf> {
+    let mut found = Vec::new();
+    let mut folders = vec![folder.to_owned()];
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            match path.extension().and_then(|ending| ending.to_str()) {
+                _ if path.is_dir() => folders.push(path),
+                Some("jpg" | "png") => found.push(path),
+                _ => {}
+            }
+        }
+    }
+    found.sort();
+    found.into_iter().step_by(every).collect()
+}
+
+#[test]
+fn no_good_photo_is_called_blurred_or_badly_exposed() {
+    let sets = [("example", 1), ("small", 1), ("train", 3), ("real-labelled", 1), ("missouri-west", 12)];
+    for (set, every) in sets {
+        let Some(folder) = data(set) else { return };
+        images(&folder, every).par_iter().for_each(|path| {
+            let name = path.to_str().unwrap();
+            let facts = examine(path, name, inspect(path, name, DEFAULT_MAX_PIXELS).unwrap()).unwrap();
+            assert_eq!(facts.quality.flaws(), [], "{name}: {:?}", facts.quality);
+        });
+    }
 }

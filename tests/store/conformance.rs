@@ -1,6 +1,8 @@
 //! The suite. Times are given, so nothing waits.
 
 use heliomap::plant::{Layer, ModuleId, PlantId, Warning};
+use heliomap::reconstruction::PhotoFacts;
+use heliomap::store::requests::{Begun, KeptAnswer};
 use heliomap::store::{
     AuditEntry, Cancelled, Checkpoint, Claim, Completed, Created, Digest, Ending, Enqueued, FeatureQuery, FileRecord,
     FileWritten, GeoBox, Heartbeat, Job, JobRequest, JobState, KeyId, NewFeature, NewKey, NewLayer, NewModel,
@@ -54,6 +56,8 @@ fn file(path: &str, content: &str) -> FileRecord {
         size: content.len() as u64,
         sha256: Digest::of(content.as_bytes()),
         size_px: None,
+        photo: None,
+        shots: None,
         stored: at(0),
     }
 }
@@ -114,8 +118,41 @@ pub async fn files_all_or_none(store: &dyn Store) {
     let files = store.files(survey.id).await.unwrap();
     assert_eq!((files.len(), files[0].size, files[0].size_px), (2, 5, Some([4, 3])));
     assert_eq!(files[0].sha256, Digest::of(b"other"));
+    let found = store.file(survey.id, &files[0].path).await.unwrap().unwrap();
+    assert_eq!((found.path, found.photo, found.shots), (files[0].path.clone(), None, None));
     let nobody = store.put_files(heliomap::store::SurveyId(Uuid::nil()), &[a]).await;
     assert!(matches!(nobody, Err(StoreError::Gone { what: "survey" })));
+}
+
+pub async fn photos_and_what_was_found_in_them(store: &dyn Store) {
+    let survey = survey(store, plant(store, "A").await.id, "June").await;
+    let facts: PhotoFacts = serde_json::from_value(serde_json::json!({
+        "camera": "DJI FC6310", "taken": null,
+        "position": {"latitude_deg": 50.0, "longitude_deg": 8.0, "height_m": null},
+        "quality": {"fine": 0.5, "coarse": 1.0, "dark_share": 0.0, "bright_share": 0.25},
+    }))
+    .unwrap();
+    let plain = [file("images/b.jpg", "1"), file("images/a.jpg", "1"), file("images/c.jpg", "2")];
+    store.put_files(survey.id, &plain).await.unwrap();
+    let told = FileRecord { photo: Some(facts.clone()), ..file("images/b.jpg", "1") };
+    assert_eq!(store.put_files(survey.id, &[told]).await.unwrap(), [FileWritten::Unchanged]);
+    let shots = Some(vec!["a.jpg".to_owned(), "d.jpg".to_owned()]);
+    let others = [
+        FileRecord { shots: shots.clone(), ..file("reconstruction.json", "1") },
+        file("undistorted/images/a.jpg", "1"),
+    ];
+    store.put_files(survey.id, &others).await.unwrap();
+
+    let first = store.photos(survey.id, None, 2).await.unwrap();
+    let names = |photos: &[FileRecord]| photos.iter().map(|p| p.path.file_name().to_owned()).collect::<Vec<_>>();
+    assert_eq!(names(&first), ["a.jpg", "b.jpg"]);
+    assert_eq!(names(&store.photos(survey.id, Some(&first[1].path), 9).await.unwrap()), ["c.jpg"]);
+    assert_eq!((&first[0].photo, &first[1].photo), (&None, &Some(facts)));
+    let reconstruction = store.file(survey.id, &others[0].path).await.unwrap().unwrap();
+    assert_eq!(reconstruction.shots, shots);
+    let same = store.photos_of_digest(survey.id, Digest::of(b"1"), 9).await.unwrap();
+    assert_eq!(same.iter().map(SurveyPath::as_str).collect::<Vec<_>>(), ["images/a.jpg", "images/b.jpg"]);
+    assert_eq!(store.photos_of_digest(survey.id, Digest::of(b"1"), 1).await.unwrap().len(), 1);
 }
 
 pub async fn one_unfinished_job_per_survey(store: &dyn Store) {
@@ -530,4 +567,25 @@ pub async fn uploads(store: &dyn Store) {
     assert!(store.delete_upload(survey.id, id).await.unwrap());
     upload.survey = SurveyId(Uuid::nil());
     assert!(matches!(store.create_upload(&upload).await, Err(StoreError::Gone { what: "survey" })));
+}
+
+pub async fn named_requests(store: &dyn Store) {
+    let (a, b) = (organisation(store, "A").await, organisation(store, "B").await);
+    let begin =
+        async |organisation, now| store.begin_request(organisation, "one", at(now), at(now + 60)).await.unwrap();
+    assert_eq!(begin(a, 0).await, Begun::New);
+    assert_eq!(begin(a, 59).await, Begun::Running);
+    assert_eq!(begin(b, 0).await, Begun::New, "names are each organisation's own");
+    // Whoever had it died over it.
+    assert_eq!(begin(a, 60).await, Begun::New);
+    let answer =
+        KeptAnswer { fingerprint: Digest::of(b"x"), status: 201, headers: "{}".to_owned(), body: vec![0, 159, 255] };
+    store.keep_answer(a, "one", &answer, at(1000)).await.unwrap();
+    assert_eq!(begin(a, 200).await, Begun::Answered(Box::new(answer.clone())));
+    store.forget_request(a, "one").await.unwrap();
+    assert_eq!(begin(a, 200).await, Begun::Answered(Box::new(answer)), "what was answered stays");
+    store.forget_request(b, "one").await.unwrap();
+    assert_eq!(begin(b, 1).await, Begun::New);
+    store.forget_old_requests(at(1000)).await.unwrap();
+    assert_eq!(begin(a, 999).await, Begun::New);
 }

@@ -41,7 +41,22 @@ export interface Survey {
 export interface SurveyDetail extends Survey {
   complete: boolean;
   missing: { code: string; message: string }[];
+  images: { uploaded: number; reconstructed?: number; not_reconstructed: string[]; not_uploaded: string[] };
   files: { path: string; kind: string; size: number }[];
+}
+
+/** A photo of a survey with its verdict. */
+export interface Photo {
+  name: string;
+  warnings?: { code: string; message: string }[];
+}
+
+/** Where a photo was taken. */
+export interface PhotoPosition {
+  type: "Feature";
+  id: string;
+  geometry: { type: "Point"; coordinates: number[] };
+  properties: { name: string; taken: string | null; reconstructed: boolean | null; warnings: string[] };
 }
 
 export interface Job {
@@ -141,9 +156,9 @@ async function request<T>(path: string, init: RequestInit = {}): Promise<T> {
   );
 }
 
-async function all<T>(path: string, signal?: AbortSignal): Promise<T[]> {
+async function all<T>(path: string, signal?: AbortSignal, filter = ""): Promise<T[]> {
   const items: T[] = [];
-  let next: string | undefined = `${ROOT}${path}?limit=1000`;
+  let next: string | undefined = `${ROOT}${path}?limit=1000${filter}`;
   while (next) {
     const part: List<T> = await request<List<T>>(next, signal ? { signal } : {});
     items.push(...part.items);
@@ -157,6 +172,10 @@ export const listModels = (plant: string, signal?: AbortSignal) => all<Model>(`/
 export const listSurveys = (plant: string, signal?: AbortSignal) => all<Survey>(`/plants/${plant}/surveys`, signal);
 export const getSurvey = (survey: Survey) =>
   request<SurveyDetail>(`${ROOT}/plants/${survey.plant}/surveys/${survey.id}`);
+export const listWarnedPhotos = (survey: Survey) =>
+  all<Photo>(`/plants/${survey.plant}/surveys/${survey.id}/images`, undefined, "&warning=any");
+export const getPhotoPositions = async (survey: Survey) =>
+  (await request<{ features: PhotoPosition[] }>(`${ROOT}/plants/${survey.plant}/surveys/${survey.id}/images.geojson`)).features;
 export const getModel = (plant: string, version: number, signal: AbortSignal) =>
   request<ModelDetail>(`${ROOT}/plants/${plant}/models/${version}`, { signal });
 

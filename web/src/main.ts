@@ -39,7 +39,7 @@ const map = openMap();
 const surveys = new Surveys(byId("surveys"), (plant, version) => {
   // Identifiers outlive models: the module that is looked at stays in sight.
   if (plant === plants.value) void attempt(() => openPlant(plant, version, shown.selected));
-});
+}, (photos) => void map?.showPhotos(photos));
 
 function openMap(): PlantMap | undefined {
   try {

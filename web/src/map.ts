@@ -10,7 +10,7 @@ import {
 } from "maplibre-gl";
 import "maplibre-gl/dist/maplibre-gl.css";
 import workerUrl from "maplibre-gl/dist/maplibre-gl-worker.mjs?url";
-import type { Feature, GroupProperties, ModuleProperties, Position } from "./api";
+import type { Feature, GroupProperties, ModuleProperties, PhotoPosition, Position } from "./api";
 import { type ColorBy, expression } from "./colors";
 
 setWorkerUrl(workerUrl);
@@ -47,6 +47,7 @@ export class PlantMap {
           modules: { type: "geojson", data: collection([]) as never, promoteId: "id", maxzoom: 20, tolerance: 0 },
           outlines: { type: "geojson", data: collection([]) as never, maxzoom: 20, tolerance: 0 },
           labels: { type: "geojson", data: collection([]) as never },
+          photos: { type: "geojson", data: collection([]) as never },
         },
         layers: [
           { id: "ground", type: "background", paint: { "background-color": "#eceae4" } },
@@ -95,6 +96,26 @@ export class PlantMap {
                 0,
               ],
             },
+          },
+          {
+            id: "photos",
+            type: "circle",
+            source: "photos",
+            paint: {
+              "circle-radius": ["interpolate", ["linear"], ["zoom"], 14, 3, 20, 7],
+              // Red: something is wrong with it. White: the reconstruction leaves it out.
+              "circle-color": ["case", ["get", "warned"], "#d1495b", ["get", "left"], "#ffffff", INK],
+              "circle-stroke-color": INK,
+              "circle-stroke-width": 1.5,
+            },
+          },
+          {
+            id: "photo-names",
+            type: "symbol",
+            source: "photos",
+            minzoom: 17,
+            layout: { "text-field": ["get", "name"], "text-font": FONT, "text-size": 11, "text-anchor": "top", "text-offset": [0, 0.7] },
+            paint: { "text-color": INK, "text-halo-color": "#ffffff", "text-halo-width": 1.5 },
           },
           {
             id: "numbers",
@@ -207,6 +228,22 @@ export class PlantMap {
     this.setData("labels", [...labels(layers.lines, "line", west), ...labels(layers.benches, "bench", north)]);
     this.bounds = bounds.isEmpty() ? undefined : bounds;
     this.fit();
+  }
+
+  /** Shows where photos were taken, in place of those before. */
+  async showPhotos(photos: PhotoPosition[]): Promise<void> {
+    await this.ready;
+    const features = photos.map(({ geometry, properties: { name, warnings, reconstructed } }) => ({
+      type: "Feature",
+      geometry,
+      properties: { name, warned: warnings.length > 0, left: reconstructed === false },
+    }));
+    this.setData("photos", features);
+    if (features.length === 0) return;
+    const bounds = new LngLatBounds();
+    for (const { geometry } of photos) bounds.extend([geometry.coordinates[0] ?? 0, geometry.coordinates[1] ?? 0]);
+    if (this.bounds) bounds.extend(this.bounds);
+    this.map.fitBounds(bounds, { padding: 60, animate: false, maxZoom: 20 });
   }
 
   private setData(source: string, features: object[]): void {

@@ -1,6 +1,18 @@
 // Surveys of a plant and how far their mappings are.
 
-import { cancelJob, getSurvey, type Job, latestJob, listSurveys, Problem, startJob, type Survey } from "./api";
+import {
+  cancelJob,
+  getPhotoPositions,
+  getSurvey,
+  type Job,
+  latestJob,
+  listSurveys,
+  listWarnedPhotos,
+  type PhotoPosition,
+  Problem,
+  startJob,
+  type Survey,
+} from "./api";
 import { h, moment, plural } from "./dom";
 
 const POLL_MS = 1000;
@@ -21,10 +33,11 @@ const isFinal = (job: Job) => job.state !== "queued" && job.state !== "running";
 export class Surveys {
   private stop = new AbortController();
 
-  /** `mapped` hears when a job has made a model. */
+  /** `mapped` hears when a job has made a model, `located` where the photos of the survey that is looked at were taken. */
   constructor(
     private readonly place: HTMLElement,
     private readonly mapped: (plant: string, version: number) => void,
+    private readonly located: (photos: PhotoPosition[]) => void,
   ) {}
 
   /** Shows the surveys of a plant, or none. */
@@ -33,6 +46,7 @@ export class Surveys {
     const stop = new AbortController();
     this.stop = stop;
     this.place.replaceChildren();
+    this.located([]);
     if (!plant) return;
     const surveys = await listSurveys(plant, stop.signal);
     if (stop.signal.aborted) return;
@@ -46,10 +60,12 @@ export class Surveys {
 
   private entry(survey: Survey, signal: AbortSignal): HTMLElement {
     const job = h("div", { class: "job" });
-    const files = h("p", { class: "quiet" });
-    const details = h("details", {}, h("summary", {}, "Files"), files);
+    const files = h("div", {});
+    // One survey at a time is looked at: its photos are those on the map.
+    const details = h("details", { name: "survey-photos" }, h("summary", {}, "Photos and files"), files);
     details.addEventListener("toggle", () => {
-      if (details.open && !files.textContent) void describeFiles(survey, files);
+      if (details.open) void this.describe(survey, files, () => details.open && !signal.aborted);
+      else if (!this.place.querySelector("details[open]")) this.located([]);
     });
     void this.follow(survey, job, signal);
     return h("article", { class: "survey" }, h("h3", {}, survey.name), job, details);
@@ -78,6 +94,41 @@ export class Surveys {
         place.append(h("p", { class: "trouble" }, `${told(error)} Asking again in ${Math.round(pause / 1000)} s.`));
       }
       await new Promise((resolve) => setTimeout(resolve, pause));
+    }
+  }
+
+  /** Says what a survey holds and what is wrong with its photos, and shows where they were taken. */
+  private async describe(survey: Survey, place: HTMLElement, isOpen: () => boolean): Promise<void> {
+    try {
+      const [detail, warned, positions] = await Promise.all([
+        getSurvey(survey),
+        listWarnedPhotos(survey),
+        getPhotoPositions(survey),
+      ]);
+      if (!isOpen()) return;
+      const { files, missing, images } = detail;
+      const megabytes = files.reduce((sum, file) => sum + file.size, 0) / 1e6;
+      const left = images.not_reconstructed.length;
+      place.replaceChildren(
+        h(
+          "p",
+          { class: "quiet" },
+          `${plural(images.uploaded, "photo")}, ${plural(files.length - images.uploaded, "file")} of the reconstruction, ` +
+            `${megabytes.toFixed(1)} MB. ${plural(positions.length, "photo")} on the map.`,
+        ),
+        ...missing.map(({ message }) => h("p", { class: "trouble" }, message)),
+        ...(left > 0 ? [h("p", {}, `${plural(left, "photo is", "photos are")} not in the reconstruction.`)] : []),
+        h(
+          "ul",
+          { class: "images" },
+          ...warned.map(({ name, warnings = [] }) =>
+            h("li", {}, h("strong", {}, name), ` ${warnings.map(({ message }) => message).join("; ")}`),
+          ),
+        ),
+      );
+      this.located(positions);
+    } catch (error) {
+      place.replaceChildren(h("p", { class: "trouble" }, told(error)));
     }
   }
 
@@ -145,20 +196,6 @@ function standing(job: Job): { text: string; share?: number } {
     text: `Step ${progress.stage_number} of ${progress.stage_count}: ${stage} (${progress.done} of ${progress.total})`,
     share: (Math.max(0, progress.stage_number - 1) + part) / Math.max(1, progress.stage_count),
   };
-}
-
-async function describeFiles(survey: Survey, place: HTMLElement): Promise<void> {
-  try {
-    const { files, missing } = await getSurvey(survey);
-    const images = files.filter((file) => file.kind === "image").length;
-    const megabytes = files.reduce((sum, file) => sum + file.size, 0) / 1e6;
-    const lacks = missing.map((missing) => missing.message).join("; ");
-    place.textContent =
-      `${plural(images, "photo")}, ${plural(files.length - images, "file")} of the reconstruction, ` +
-      `${megabytes.toFixed(1)} MB. ${lacks}`;
-  } catch (error) {
-    place.textContent = told(error);
-  }
 }
 
 export function told(error: unknown): string {

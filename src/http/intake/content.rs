@@ -1,28 +1,50 @@
 //! Whether a file holds what its name says.
 
-use super::disk;
+use super::{disk, shots};
 use crate::config::Limits;
 use crate::http::error::{ApiError, Code};
+use crate::reconstruction::PhotoFacts;
 use crate::reconstruction::photo::{self, PhotoError};
-use crate::store::{Content, SurveyPath};
+use crate::store::{Content, FileKind, SurveyPath};
 use serde::de::IgnoredAny;
+use std::collections::BTreeSet;
 use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::Path;
 
-/// Checks a file by what it must hold at its place in the survey. Width and height in pixels, where it is an image.
-pub fn check(file: &Path, place: &SurveyPath, limits: &Limits) -> Result<Option<[u32; 2]>, ApiError> {
+/// What was found in a file.
+#[derive(Debug, Default)]
+pub struct Found {
+    /// Width and height in pixels, where it is an image.
+    pub size_px: Option<[u32; 2]>,
+    /// Where it is a photo.
+    pub photo: Option<PhotoFacts>,
+    /// The images that it names, sorted, where it is a reconstruction that could be read.
+    pub shots: Option<Vec<String>>,
+}
+
+/// Checks a file by what it must hold at its place in the survey.
+pub fn check(file: &Path, place: &SurveyPath, limits: &Limits) -> Result<Found, ApiError> {
     match place.content() {
-        Content::Image => image(file, place, limits).map(Some),
-        Content::Json { array } => json(file, place, array).map(|()| None),
-        Content::Ply => ply(file, place).map(|()| None),
+        Content::Image => image(file, place, limits),
+        Content::Json { array } => Ok(Found { shots: json(file, place, array)?, ..Found::default() }),
+        Content::Ply => ply(file, place).map(|()| Found::default()),
     }
 }
 
-fn image(file: &Path, place: &SurveyPath, limits: &Limits) -> Result<[u32; 2], ApiError> {
+/// A photo is decoded, so that what cannot be decoded is refused while the drone is still in the field; undistorted images
+/// were made from photos, and are not.
+fn image(file: &Path, place: &SurveyPath, limits: &Limits) -> Result<Found, ApiError> {
     let max_pixels = (limits.max_image_megapixels * 1e6) as u64;
-    match photo::inspect_whole(file, place.as_str(), max_pixels) {
-        Ok(header) => Ok([header.width_px, header.height_px]),
+    let looked = match place.kind() {
+        FileKind::Image => photo::inspect(file, place.as_str(), max_pixels)
+            .and_then(|header| Ok((header, Some(photo::examine(file, place.as_str(), header)?)))),
+        FileKind::Reconstruction => photo::inspect_whole(file, place.as_str(), max_pixels).map(|header| (header, None)),
+    };
+    match looked {
+        Ok((header, photo)) => {
+            Ok(Found { size_px: Some([header.width_px, header.height_px]), photo, ..Found::default() })
+        }
         Err(error) => Err(match error {
             PhotoError::Unreadable { source, .. } => disk(file, source),
             PhotoError::NotAnImage { .. } => ApiError::new(Code::ImageUnreadable, error.to_string()),
@@ -40,7 +62,8 @@ fn image(file: &Path, place: &SurveyPath, limits: &Limits) -> Result<[u32; 2], A
     }
 }
 
-fn json(file: &Path, place: &SurveyPath, array: bool) -> Result<(), ApiError> {
+/// Checks a document; the images that it names, where it is a reconstruction whose shots could be read.
+fn json(file: &Path, place: &SurveyPath, array: bool) -> Result<Option<Vec<String>>, ApiError> {
     let wrong = |what: &str| {
         ApiError::new(
             Code::FileUnreadable,
@@ -55,9 +78,16 @@ fn json(file: &Path, place: &SurveyPath, array: bool) -> Result<(), ApiError> {
         (_, true) => return Err(wrong("is no JSON array of reconstructions")),
         (_, false) => return Err(wrong("is no JSON object")),
     }
+    if array {
+        let components: Result<Vec<shots::Component>, _> = serde_json::from_reader(open()?);
+        if let Ok(components) = components {
+            let names: BTreeSet<String> = components.into_iter().flat_map(|component| component.shots.0).collect();
+            return Ok(Some(names.into_iter().collect()));
+        }
+    }
     let document: Result<IgnoredAny, _> = serde_json::from_reader(open()?);
     match document {
-        Ok(_) => Ok(()),
+        Ok(_) => Ok(None),
         Err(error) if error.is_io() => Err(disk(file, error.into())),
         Err(error) if error.is_eof() => Err(wrong("is cut short")),
         Err(error) => Err(wrong(&format!("is no valid JSON: {error} (NaN and Infinity are none)"))),

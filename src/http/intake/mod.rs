@@ -4,11 +4,13 @@ pub mod archive;
 pub mod content;
 pub mod digest;
 pub mod receive;
+mod shots;
 
 use super::error::{ApiError, Code};
 use super::state::AppState;
 use crate::plant::PlantId;
-use crate::store::{FileRecord, FileWritten, StagedFile, SurveyId, SurveyPath};
+use crate::store::{FileKind, FileRecord, FileWritten, StagedFile, SurveyId, SurveyPath};
+use content::Found;
 use jiff::Timestamp;
 use std::path::Path;
 
@@ -16,16 +18,34 @@ use std::path::Path;
 pub struct Checked {
     pub path: SurveyPath,
     pub staged: StagedFile,
-    /// Width and height in pixels, where it is an image.
-    pub size_px: Option<[u32; 2]>,
+    pub found: Found,
 }
+
+/// A file that was stored.
+pub struct Stored {
+    pub record: FileRecord,
+    pub written: FileWritten,
+    /// Other photos of the survey with the same bytes, the first few.
+    pub twins: Vec<SurveyPath>,
+}
+
+/// How many photos with the same bytes are named.
+const MAX_TWINS: u32 = 5;
 
 /// Checks that a staged file holds what its place in the survey says.
 pub async fn check(state: &AppState, path: SurveyPath, staged: StagedFile) -> Result<Checked, ApiError> {
     let limits = state.limits.clone();
+    // Photos are decoded: a few at once, so that many that come together take neither all memory nor all cores.
+    let turn = match path.kind() {
+        FileKind::Image => {
+            Some(state.decoding.clone().acquire_owned().await.map_err(|error| ApiError::internal(&error))?)
+        }
+        FileKind::Reconstruction => None,
+    };
     let work = tokio::task::spawn_blocking(move || {
-        let size_px = content::check(&staged.path, &path, &limits)?;
-        Ok(Checked { path, staged, size_px })
+        let found = content::check(&staged.path, &path, &limits)?;
+        drop(turn);
+        Ok(Checked { path, staged, found })
     });
     work.await.unwrap_or_else(|error| Err(ApiError::internal(&error)))
 }
@@ -36,25 +56,43 @@ pub async fn store(
     plant: PlantId,
     survey: SurveyId,
     files: Vec<Checked>,
-) -> Result<Vec<(FileRecord, FileWritten)>, ApiError> {
+) -> Result<Vec<Stored>, ApiError> {
     // As exact as the store keeps it, so that every answer says the same.
     let now = Timestamp::now();
     let stored = Timestamp::from_millisecond(now.as_millisecond()).unwrap_or(now);
     let mut records = Vec::with_capacity(files.len());
-    for Checked { path, staged, size_px } in files {
-        records.push(FileRecord { path, size: staged.size, sha256: staged.sha256, size_px, stored });
+    for Checked { path, staged, found } in files {
+        let Found { size_px, photo, shots } = found;
+        records.push(FileRecord { path, size: staged.size, sha256: staged.sha256, size_px, photo, shots, stored });
         state.blobs.put_file(plant, staged).await?;
     }
-    match state.store.put_files(survey, &records).await {
-        Ok(written) => Ok(records.into_iter().zip(written).collect()),
+    let written = match state.store.put_files(survey, &records).await {
+        Ok(written) => written,
         Err(error) => {
             // The plant went while its files came: they go too.
             if state.store.plant(plant).await?.is_none() {
                 state.blobs.delete_plant(plant).await?;
             }
-            Err(error.into())
+            return Err(error.into());
         }
+    };
+    let mut stored = Vec::with_capacity(records.len());
+    for (record, written) in records.into_iter().zip(written) {
+        let twins = twins(state, survey, &record).await?;
+        stored.push(Stored { record, written, twins });
     }
+    Ok(stored)
+}
+
+/// Other photos of the survey with the bytes of a photo, the first few.
+pub async fn twins(state: &AppState, survey: SurveyId, file: &FileRecord) -> Result<Vec<SurveyPath>, ApiError> {
+    if file.path.kind() != FileKind::Image {
+        return Ok(Vec::new());
+    }
+    let mut twins = state.store.photos_of_digest(survey, file.sha256, MAX_TWINS + 1).await?;
+    twins.retain(|path| *path != file.path);
+    twins.truncate(MAX_TWINS as usize);
+    Ok(twins)
 }
 
 /// A failure of the service's own disk.

@@ -3,13 +3,14 @@
 
 mod access;
 mod read;
+mod requests;
 mod uploads;
 
 use super::super::sql;
 use super::super::{
-    Cancelled, Checkpoint, Claim, Completed, Created, Ending, Enqueued, Feature, FeatureQuery, FileRecord, FileWritten,
-    GeoBox, Heartbeat, Job, JobId, JobRequest, LayerInfo, Model, NewFeature, NewModel, OrganisationId, Page, Plant,
-    Progress, Store, StoreError, Survey, SurveyId,
+    Cancelled, Checkpoint, Claim, Completed, Created, Digest, Ending, Enqueued, Feature, FeatureQuery, FileRecord,
+    FileWritten, GeoBox, Heartbeat, Job, JobId, JobRequest, LayerInfo, Model, NewFeature, NewModel, OrganisationId,
+    Page, Plant, Progress, Store, StoreError, Survey, SurveyId, SurveyPath,
 };
 use super::{Row, Rows, Tx};
 use crate::plant::{Layer, ModuleId, PlantId};
@@ -143,7 +144,17 @@ impl Store for Rows {
                 Some(_) => FileWritten::Replaced,
                 None => FileWritten::Created,
             };
-            if verdict != FileWritten::Unchanged {
+            let photo = file.photo.as_ref().map(|photo| serde_json::json!(photo).to_string());
+            let shots = file.shots.as_ref().map(|shots| serde_json::json!(shots).to_string());
+            if verdict == FileWritten::Unchanged {
+                sqlx::query(sql::COMPLETE_FILE)
+                    .bind(survey.to_string())
+                    .bind(file.path.as_str())
+                    .bind(photo)
+                    .bind(shots)
+                    .execute(&mut *tx)
+                    .await?;
+            } else {
                 sqlx::query(sql::PUT_FILE)
                     .bind(survey.to_string())
                     .bind(file.path.as_str())
@@ -152,6 +163,8 @@ impl Store for Rows {
                     .bind(digest)
                     .bind(file.size_px.map(|size| i64::from(size[0])))
                     .bind(file.size_px.map(|size| i64::from(size[1])))
+                    .bind(photo)
+                    .bind(shots)
                     .bind(file.stored.as_millisecond())
                     .execute(&mut *tx)
                     .await
@@ -166,6 +179,35 @@ impl Store for Rows {
     async fn files(&self, survey: SurveyId) -> Result<Vec<FileRecord>, StoreError> {
         let rows = sqlx::query(sql::FILES).bind(survey.to_string()).fetch_all(&self.read).await?;
         rows.iter().map(file).collect()
+    }
+
+    async fn file(&self, survey: SurveyId, path: &SurveyPath) -> Result<Option<FileRecord>, StoreError> {
+        let query = sqlx::query(sql::FILE).bind(survey.to_string()).bind(path.as_str());
+        query.fetch_optional(&self.read).await?.as_ref().map(file).transpose()
+    }
+
+    async fn photos(
+        &self,
+        survey: SurveyId,
+        after: Option<&SurveyPath>,
+        limit: u32,
+    ) -> Result<Vec<FileRecord>, StoreError> {
+        let query = sqlx::query(sql::PHOTOS)
+            .bind(survey.to_string())
+            .bind(after.map_or("", SurveyPath::as_str))
+            .bind(i64::from(limit));
+        query.fetch_all(&self.read).await?.iter().map(file).collect()
+    }
+
+    async fn photos_of_digest(
+        &self,
+        survey: SurveyId,
+        sha256: Digest,
+        limit: u32,
+    ) -> Result<Vec<SurveyPath>, StoreError> {
+        let query =
+            sqlx::query(sql::PHOTOS_OF_DIGEST).bind(survey.to_string()).bind(sha256.to_string()).bind(i64::from(limit));
+        query.fetch_all(&self.read).await?.iter().map(read::path).collect()
     }
 
     async fn enqueue_job(&self, request: &JobRequest, now: Timestamp) -> Result<Enqueued, StoreError> {

@@ -2,11 +2,13 @@
 
 use super::super::Row;
 use crate::plant::{PlantId, Warning};
+use crate::store::requests::KeptAnswer;
 use crate::store::{
     ApiKey, AuditEntry, FileRecord, Job, JobId, KeyId, Model, Organisation, OrganisationId, Plant, Progress,
     StoreError, Survey, SurveyId, SurveyPath, Upload, UploadId,
 };
 use jiff::Timestamp;
+use serde::de::DeserializeOwned;
 use sqlx::Row as _;
 use std::str::FromStr;
 use uuid::Uuid;
@@ -73,15 +75,21 @@ pub fn survey(row: &Row) -> Result<Survey, StoreError> {
     })
 }
 
-pub fn file(row: &Row) -> Result<FileRecord, StoreError> {
+pub fn path(row: &Row) -> Result<SurveyPath, StoreError> {
     let path: String = row.try_get("path")?;
+    SurveyPath::parse(&path).map_err(|_| StoreError::Corrupt { what: "path of a file", value: path })
+}
+
+pub fn file(row: &Row) -> Result<FileRecord, StoreError> {
     let width_px = optional_small(row, "width_px")?;
     let height_px = optional_small(row, "height_px")?;
     Ok(FileRecord {
-        path: SurveyPath::parse(&path).map_err(|_| StoreError::Corrupt { what: "path of a file", value: path })?,
+        path: path(row)?,
         size: row.try_get::<i64, _>("size")? as u64,
         sha256: parsed(row, "sha256")?,
         size_px: width_px.zip(height_px).map(|(width, height)| [width, height]),
+        photo: optional_document(row, "photo")?,
+        shots: optional_document(row, "shots")?,
         stored: time(row, "stored_ms")?,
     })
 }
@@ -97,6 +105,18 @@ pub fn upload(row: &Row) -> Result<Upload, StoreError> {
         expires: time(row, "expires_ms")?,
         outcome: row.try_get("outcome")?,
     })
+}
+
+/// The answer to a request, where it was answered.
+pub fn kept_answer(row: &Row) -> Result<Option<KeptAnswer>, StoreError> {
+    let status: Option<i64> = row.try_get("status")?;
+    let Some(status) = status else { return Ok(None) };
+    Ok(Some(KeptAnswer {
+        fingerprint: parsed(row, "fingerprint")?,
+        status: small("status", status)?,
+        headers: row.try_get("headers")?,
+        body: row.try_get("body")?,
+    }))
 }
 
 pub fn job(row: &Row) -> Result<Job, StoreError> {
@@ -169,6 +189,15 @@ fn parsed<T: FromStr>(row: &Row, column: &'static str) -> Result<T, StoreError> 
 
 pub fn uuid(row: &Row, column: &'static str) -> Result<Uuid, StoreError> {
     parsed(row, column)
+}
+
+/// A JSON document.
+fn optional_document<T: DeserializeOwned>(row: &Row, column: &'static str) -> Result<Option<T>, StoreError> {
+    let value: Option<String> = row.try_get(column)?;
+    let read = |value: String| {
+        serde_json::from_str(&value).map_err(|_| StoreError::Corrupt { what: column, value: value.clone() })
+    };
+    value.map(read).transpose()
 }
 
 fn warnings(row: &Row) -> Result<Vec<Warning>, StoreError> {

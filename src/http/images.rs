@@ -1,0 +1,437 @@
+//! The photos of a survey, each with a verdict: what the pilot should know before leaving the field.
+
+use super::AppState;
+use super::error::{ApiError, Code, Problem};
+use super::extract::{ApiPath, ApiQuery};
+use super::intake;
+use super::paging::{List, list_limit};
+use crate::jobs;
+use crate::plant::PlantId;
+use crate::reconstruction::PhotoFacts;
+use crate::reconstruction::quality::Flaw;
+use crate::store::{FileKind, FileRecord, SurveyId, SurveyPath};
+use axum::extract::State;
+use axum::http::header;
+use axum::response::{IntoResponse, Response};
+use base64::Engine;
+use base64::prelude::BASE64_URL_SAFE_NO_PAD;
+use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
+use serde_json::json;
+use std::collections::BTreeSet;
+
+/// Photos per look into the store.
+const CHUNK: u32 = 1000;
+
+/// A file of a survey.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub struct FileView {
+    /// Its place in the survey's folder.
+    #[schema(example = "images/DJI_0001.jpg")]
+    pub path: String,
+    /// `image` or `reconstruction`.
+    pub kind: &'static str,
+    /// Bytes.
+    pub size: u64,
+    /// SHA-256 of its bytes, hexadecimal.
+    #[schema(min_length = 64, max_length = 64)]
+    pub sha256: String,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub width_px: Option<u32>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub height_px: Option<u32>,
+    /// What a photo tells of itself and how good it is.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub photo: Option<PhotoView>,
+    /// What the pilot should know of a photo before leaving the field.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[schema(required = false)]
+    pub warnings: Vec<PhotoWarning>,
+    #[schema(value_type = String, format = DateTime)]
+    pub stored: Timestamp,
+}
+
+impl FileView {
+    /// A file, and other photos with the same bytes.
+    pub fn new(file: FileRecord, twins: &[SurveyPath]) -> Self {
+        Self {
+            path: file.path.to_string(),
+            kind: file.path.kind().as_str(),
+            size: file.size,
+            sha256: file.sha256.to_string(),
+            width_px: file.size_px.map(|size| size[0]),
+            height_px: file.size_px.map(|size| size[1]),
+            warnings: warnings(&file, twins),
+            photo: file.photo.map(PhotoView::from),
+            stored: file.stored,
+        }
+    }
+}
+
+/// What a photo tells of itself, and what was measured on it.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub struct PhotoView {
+    /// Make and model of the camera.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(example = "DJI FC6310")]
+    pub camera: Option<String>,
+    /// When it was taken, by the camera's clock; with an offset from UTC only where the file tells one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(example = "2026-06-21T10:11:12")]
+    pub taken: Option<String>,
+    /// Longitude, latitude (degrees, WGS 84) and, where the file tells it, height (metres, as the drone wrote it).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(min_items = 2, max_items = 3, example = json!([8.1032, 50.2011, 162.5]))]
+    pub position: Option<Vec<f64>>,
+    /// Energy of fine detail over that of coarse detail, 0.5 and more where the photo is sharp; left out where it is too
+    /// small to tell.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(example = 0.62)]
+    pub sharpness: Option<f64>,
+    /// Share of pixels that are black, 0 to 1.
+    pub dark_share: f64,
+    /// Share of pixels that are white, 0 to 1.
+    pub bright_share: f64,
+}
+
+impl From<PhotoFacts> for PhotoView {
+    fn from(facts: PhotoFacts) -> Self {
+        let PhotoFacts { exposure, quality } = facts;
+        // What cannot be told apart need not be told.
+        let rounded = |value: f64| (value * 1e4).round() / 1e4;
+        Self {
+            camera: exposure.camera,
+            taken: exposure.taken,
+            position: exposure.position.map(|position| {
+                [Some(position.longitude_deg), Some(position.latitude_deg), position.height_m]
+                    .into_iter()
+                    .flatten()
+                    .collect()
+            }),
+            sharpness: quality.fine.map(rounded),
+            dark_share: rounded(quality.dark_share),
+            bright_share: rounded(quality.bright_share),
+        }
+    }
+}
+
+/// Something that the pilot should know of a photo.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub struct PhotoWarning {
+    /// `blurred`, `underexposed`, `overexposed`, `no_position`, `no_time` or `duplicate`.
+    #[schema(example = "blurred")]
+    pub code: &'static str,
+    /// What is wrong and what to do.
+    pub message: String,
+}
+
+/// Words of all warnings of photos.
+const WARNINGS: [&str; 6] = ["blurred", "underexposed", "overexposed", "no_position", "no_time", "duplicate"];
+
+fn warnings(file: &FileRecord, twins: &[SurveyPath]) -> Vec<PhotoWarning> {
+    let Some(photo) = &file.photo else { return Vec::new() };
+    let mut warnings = Vec::new();
+    let mut warn = |code, message: String| warnings.push(PhotoWarning { code, message });
+    for flaw in photo.quality.flaws() {
+        match flaw {
+            Flaw::Blurred => {
+                warn(
+                    "blurred",
+                    "it is blurred: clean the lens, fly slower or shorten the exposure, and take it again".into(),
+                );
+            }
+            Flaw::Underexposed => {
+                let share = photo.quality.dark_share * 100.0;
+                warn("underexposed", format!("{share:.0} % of it are black: expose longer and take it again"));
+            }
+            Flaw::Overexposed => {
+                let share = photo.quality.bright_share * 100.0;
+                warn("overexposed", format!("{share:.0} % of it are white: expose shorter and take it again"));
+            }
+        }
+    }
+    if photo.exposure.position.is_none() {
+        warn("no_position", "its file tells no position: wait until the drone knows where it is".into());
+    }
+    if photo.exposure.taken.is_none() {
+        warn("no_time", "its file tells no time: send files as the camera wrote them".into());
+    }
+    if !twins.is_empty() {
+        let names: Vec<&str> = twins.iter().map(SurveyPath::file_name).collect();
+        warn("duplicate", format!("it has the same bytes as {}: one of them is too many", names.join(", ")));
+    }
+    warnings
+}
+
+/// A photo of a survey.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub struct ImageView {
+    /// Its file name.
+    #[schema(example = "DJI_0001.jpg")]
+    pub name: String,
+    /// Whether the reconstruction was made from it; left out where there is no reconstruction yet.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub reconstructed: Option<bool>,
+    #[serde(flatten)]
+    pub file: FileView,
+}
+
+/// Which photos.
+#[derive(Debug, Deserialize, utoipa::IntoParams)]
+#[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
+pub struct ImagesQuery {
+    /// Most items in the answer.
+    #[param(minimum = 1, maximum = 1000, default = 100)]
+    pub limit: Option<u32>,
+    /// Where to go on: taken from the link to the next part.
+    pub cursor: Option<String>,
+    /// Only photos with this warning: `blurred`, `underexposed`, `overexposed`, `no_position`, `no_time`, `duplicate`, or
+    /// `any`.
+    #[param(example = "blurred")]
+    pub warning: Option<String>,
+    /// Only photos from which the reconstruction was made (`true`) or was not (`false`).
+    pub reconstructed: Option<bool>,
+}
+
+impl ImagesQuery {
+    fn after(&self) -> Result<Option<SurveyPath>, ApiError> {
+        let read = |cursor: &str| {
+            let path = String::from_utf8(BASE64_URL_SAFE_NO_PAD.decode(cursor).ok()?).ok()?;
+            SurveyPath::parse(&path).ok()
+        };
+        let wrong = "the cursor is none of this service's: take it from the link to the next part";
+        let found = self.cursor.as_deref().map(|cursor| read(cursor).ok_or(ApiError::new(Code::InvalidQuery, wrong)));
+        found.transpose()
+    }
+
+    fn check_warning(&self) -> Result<(), ApiError> {
+        match self.warning.as_deref() {
+            Some(warning) if warning != "any" && !WARNINGS.contains(&warning) => {
+                Err(ApiError::new(Code::InvalidQuery, format!("warning must be any or one of {}", WARNINGS.join(", "))))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    fn wants(&self, image: &ImageView) -> bool {
+        let warned = |wanted: &str| image.file.warnings.iter().any(|warning| wanted == "any" || warning.code == wanted);
+        self.warning.as_deref().is_none_or(warned)
+            && self.reconstructed.is_none_or(|wanted| image.reconstructed == Some(wanted))
+    }
+
+    /// The link to the part after a photo.
+    fn next(&self, survey: &str, limit: u32, last: &str) -> String {
+        let cursor = BASE64_URL_SAFE_NO_PAD.encode(last);
+        let warning = self.warning.as_ref().map(|warning| format!("&warning={warning}")).unwrap_or_default();
+        let reconstructed = self.reconstructed.map(|only| format!("&reconstructed={only}")).unwrap_or_default();
+        format!("{survey}/images?limit={limit}&cursor={cursor}{warning}{reconstructed}")
+    }
+}
+
+/// The photos of a survey, part by part, each with its verdict.
+struct Photos<'a> {
+    state: &'a AppState,
+    survey: SurveyId,
+    shots: Option<BTreeSet<String>>,
+}
+
+impl<'a> Photos<'a> {
+    async fn of(state: &'a AppState, survey: SurveyId) -> Result<Self, ApiError> {
+        let mut shots = None;
+        for path in jobs::RECONSTRUCTIONS {
+            if let Some(file) = state.store.file(survey, &SurveyPath::of_reconstruction(path)?).await? {
+                shots = file.shots.map(|shots| shots.into_iter().collect());
+                break;
+            }
+        }
+        Ok(Self { state, survey, shots })
+    }
+
+    async fn part(&self, after: Option<&SurveyPath>, limit: u32) -> Result<Vec<ImageView>, ApiError> {
+        let mut images = Vec::new();
+        for file in self.state.store.photos(self.survey, after, limit).await? {
+            let twins = intake::twins(self.state, self.survey, &file).await?;
+            let name = file.path.file_name().to_owned();
+            let reconstructed = self.shots.as_ref().map(|shots| jobs::is_shot(shots, &name));
+            images.push(ImageView { name, reconstructed, file: FileView::new(file, &twins) });
+        }
+        Ok(images)
+    }
+}
+
+fn place(plant: PlantId, survey: SurveyId) -> String {
+    format!("/api/v1/plants/{plant}/surveys/{survey}")
+}
+
+/// List a survey's photos, each with its verdict
+///
+/// In the order of their names.
+#[utoipa::path(
+    get,
+    path = "/api/v1/plants/{plant}/surveys/{survey}/images",
+    tag = "surveys",
+    security(("key" = ["read"]), ("key" = ["review"]), ("key" = ["upload"])),
+    params(
+        ("plant" = Uuid, Path, description = "The plant's identifier"),
+        ("survey" = Uuid, Path, description = "The survey's identifier"),
+        ImagesQuery
+    ),
+    responses(
+        (status = 200, body = List<ImageView>),
+        (status = "4XX", description = "`plant_not_found`, `survey_not_found`, `invalid_query`", body = Problem,
+            content_type = "application/problem+json")
+    )
+)]
+pub async fn list(
+    State(state): State<AppState>,
+    ApiPath((plant, survey)): ApiPath<(PlantId, SurveyId)>,
+    ApiQuery(query): ApiQuery<ImagesQuery>,
+) -> Result<List<ImageView>, ApiError> {
+    let (limit, mut after) = (list_limit(query.limit)?, query.after()?);
+    query.check_warning()?;
+    state.require_survey(plant, survey).await?;
+    let photos = Photos::of(&state, survey).await?;
+    let mut items: Vec<ImageView> = Vec::new();
+    // One more than is shown tells whether there is a next part.
+    while items.len() <= limit as usize {
+        let part = photos.part(after.as_ref(), CHUNK.min(limit + 1)).await?;
+        let Some(last) = part.last() else { break };
+        after = Some(SurveyPath::parse(&last.file.path)?);
+        items.extend(part.into_iter().filter(|image| query.wants(image)));
+    }
+    let more = items.len() > limit as usize;
+    items.truncate(limit as usize);
+    let last = items.last().filter(|_| more);
+    let next = last.map(|last| query.next(&place(plant, survey), limit, &last.file.path));
+    Ok(List { items, next })
+}
+
+/// Where a survey's photos were taken, as GeoJSON
+///
+/// A point for each photo whose file tells a position, as the drone wrote it: longitude, latitude and, where there is one,
+/// height.
+#[utoipa::path(
+    get,
+    path = "/api/v1/plants/{plant}/surveys/{survey}/images.geojson",
+    tag = "surveys",
+    security(("key" = ["read"]), ("key" = ["review"]), ("key" = ["upload"])),
+    params(
+        ("plant" = Uuid, Path, description = "The plant's identifier"),
+        ("survey" = Uuid, Path, description = "The survey's identifier")
+    ),
+    responses(
+        (status = 200, body = ImagePositions, content_type = "application/geo+json"),
+        (status = 404, description = "`plant_not_found`, `survey_not_found`", body = Problem,
+            content_type = "application/problem+json")
+    )
+)]
+pub async fn positions(
+    State(state): State<AppState>,
+    ApiPath((plant, survey)): ApiPath<(PlantId, SurveyId)>,
+) -> Result<Response, ApiError> {
+    state.require_survey(plant, survey).await?;
+    let photos = Photos::of(&state, survey).await?;
+    let mut features = Vec::new();
+    let mut after = None;
+    loop {
+        let part = photos.part(after.as_ref(), CHUNK).await?;
+        let Some(last) = part.last() else { break };
+        after = Some(SurveyPath::parse(&last.file.path)?);
+        features.extend(part.iter().filter_map(feature));
+    }
+    let body = json!({"type": "FeatureCollection", "survey": survey, "features": features}).to_string();
+    Ok(([(header::CONTENT_TYPE, "application/geo+json")], body).into_response())
+}
+
+fn feature(image: &ImageView) -> Option<serde_json::Value> {
+    let photo = image.file.photo.as_ref()?;
+    let warnings: Vec<&str> = image.file.warnings.iter().map(|warning| warning.code).collect();
+    Some(json!({
+        "type": "Feature",
+        "id": image.name,
+        "geometry": {"type": "Point", "coordinates": photo.position.as_ref()?},
+        "properties": {
+            "name": image.name,
+            "camera": photo.camera,
+            "taken": photo.taken,
+            "reconstructed": image.reconstructed,
+            "warnings": warnings,
+        },
+    }))
+}
+
+/// A GeoJSON feature collection of points.
+#[derive(utoipa::ToSchema)]
+#[expect(dead_code, reason = "it describes what is written as JSON")]
+struct ImagePositions {
+    /// `FeatureCollection`
+    r#type: String,
+    survey: uuid::Uuid,
+    features: Vec<ImagePosition>,
+}
+
+/// A GeoJSON feature: a point.
+#[derive(utoipa::ToSchema)]
+#[expect(dead_code, reason = "it describes what is written as JSON")]
+struct ImagePosition {
+    /// `Feature`
+    r#type: String,
+    /// The photo's file name.
+    id: String,
+    /// A point: longitude, latitude and, where there is one, height.
+    geometry: serde_json::Value,
+    /// `name`, `camera`, `taken`, `reconstructed` (null where there is no reconstruction yet) and `warnings` (codes).
+    properties: serde_json::Value,
+}
+
+/// How a survey's photos and its reconstruction go together.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub struct ImagesSummary {
+    /// Photos that were uploaded.
+    pub uploaded: usize,
+    /// Of these, those whose file tells a position.
+    pub with_position: usize,
+    /// Of these, those with a warning.
+    pub with_warning: usize,
+    /// Images from which the reconstruction was made; left out where there is none yet.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub reconstructed: Option<usize>,
+    /// Photos that were uploaded and from which the reconstruction was not made.
+    pub not_reconstructed: Vec<String>,
+    /// Images from which the reconstruction was made and that were not uploaded.
+    pub not_uploaded: Vec<String>,
+}
+
+/// A survey's files, each with its verdict, and how they go together.
+pub fn summary(files: Vec<FileRecord>) -> (ImagesSummary, Vec<FileView>) {
+    let photo_names =
+        |file: &FileRecord| (file.path.kind() == FileKind::Image).then(|| file.path.file_name().to_owned());
+    let names: Vec<String> = files.iter().filter_map(photo_names).collect();
+    let shots: Option<BTreeSet<String>> = jobs::shots(&files).map(|shots| shots.iter().cloned().collect());
+    let not_uploaded = jobs::shots_without_image(&files);
+    let with_position =
+        files.iter().filter(|file| file.photo.as_ref().is_some_and(|photo| photo.exposure.position.is_some())).count();
+    let mut of_digest: std::collections::HashMap<_, Vec<SurveyPath>> = Default::default();
+    for file in files.iter().filter(|file| file.path.kind() == FileKind::Image) {
+        of_digest.entry(file.sha256).or_default().push(file.path.clone());
+    }
+    let view = |file: FileRecord| {
+        let same = of_digest.get(&file.sha256).filter(|_| file.path.kind() == FileKind::Image);
+        let twins: Vec<_> = same.into_iter().flatten().filter(|path| **path != file.path).take(5).cloned().collect();
+        FileView::new(file, &twins)
+    };
+    let views: Vec<FileView> = files.into_iter().map(view).collect();
+    let images = ImagesSummary {
+        uploaded: names.len(),
+        with_position,
+        with_warning: views.iter().filter(|view| !view.warnings.is_empty()).count(),
+        reconstructed: shots.as_ref().map(BTreeSet::len),
+        not_reconstructed: match &shots {
+            Some(shots) => names.into_iter().filter(|name| !jobs::is_shot(shots, name)).collect(),
+            None => Vec::new(),
+        },
+        not_uploaded,
+    };
+    (images, views)
+}

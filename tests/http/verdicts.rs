@@ -1,0 +1,170 @@
+//! What the pilot hears of the photos before leaving the field.
+
+use crate::app::{App, assert_problem};
+use exif::experimental::Writer;
+use exif::{Field, In, Rational, Tag, Value as Exif};
+use image::{GrayImage, Luma};
+use reqwest::StatusCode;
+use serde_json::{Value, json};
+use std::io::Cursor;
+
+/// Benches in a field, sharp.
+fn picture() -> GrayImage {
+    GrayImage::from_fn(256, 192, |x, y| {
+        let bench = (y / 30) % 2 == 0 && x % 13 > 1 && y % 15 > 1;
+        let weed = (x.wrapping_mul(2_654_435_761) ^ y.wrapping_mul(40_503)).wrapping_mul(2_246_822_519) >> 24;
+        Luma([if bench { 40 } else { 120 + (weed / 4) as u8 }])
+    })
+}
+
+/// A JPEG as a drone writes it: taken at noon at a longitude of `minutes` past 8 degrees.
+fn photo(picture: &GrayImage, minutes: u32) -> Vec<u8> {
+    let rationals = |parts: &[u32]| Exif::Rational(parts.iter().map(|num| Rational { num: *num, denom: 1 }).collect());
+    let ascii = |text: &str| Exif::Ascii(vec![text.as_bytes().to_vec()]);
+    let fields = [
+        (Tag::Make, ascii("DJI")),
+        (Tag::Model, ascii("FC6310")),
+        (Tag::DateTimeOriginal, ascii("2026:06:21 12:00:00")),
+        (Tag::GPSLatitudeRef, ascii("N")),
+        (Tag::GPSLatitude, rationals(&[50, 30, 0])),
+        (Tag::GPSLongitudeRef, ascii("E")),
+        (Tag::GPSLongitude, rationals(&[8, minutes, 0])),
+        (Tag::GPSAltitude, rationals(&[150])),
+    ]
+    .map(|(tag, value)| Field { tag, ifd_num: In::PRIMARY, value });
+    let mut writer = Writer::new();
+    fields.iter().for_each(|field| writer.push_field(field));
+    let mut tiff = Cursor::new(Vec::new());
+    writer.write(&mut tiff, false).unwrap();
+    let mut plain = Cursor::new(Vec::new());
+    picture.write_to(&mut plain, image::ImageFormat::Jpeg).unwrap();
+    let segment = [b"Exif\0\0".as_slice(), tiff.get_ref()].concat();
+    let length = u16::try_from(segment.len() + 2).unwrap().to_be_bytes();
+    [&plain.get_ref()[..2], &[0xff, 0xe1], &length, &segment, &plain.get_ref()[2..]].concat()
+}
+
+fn codes(file: &Value) -> Vec<&str> {
+    let warnings = file["warnings"].as_array();
+    warnings.into_iter().flatten().map(|warning| warning["code"].as_str().unwrap()).collect()
+}
+
+async fn put(app: &App, survey: &str, name: &str, bytes: Vec<u8>) -> Value {
+    let (status, file) = app.put(&format!("{survey}/images/{name}"), bytes).await;
+    assert_eq!(status, StatusCode::CREATED, "{file}");
+    file
+}
+
+async fn names(app: &App, path: &str) -> Vec<String> {
+    let (status, list) = app.get(path).await;
+    assert_eq!(status, StatusCode::OK, "{list}");
+    list["items"].as_array().unwrap().iter().map(|image| image["name"].as_str().unwrap().to_owned()).collect()
+}
+
+/// A survey with a good photo, a blurred one, a dark one without EXIF, and the good one again.
+async fn flown(app: &App) -> String {
+    let survey = app.survey().await;
+    let good = put(app, &survey, "good.jpg", photo(&picture(), 15)).await;
+    assert_eq!(codes(&good), [""; 0], "{good}");
+    assert_eq!(good["photo"]["camera"], "DJI FC6310");
+    assert_eq!(good["photo"]["taken"], "2026-06-21T12:00:00");
+    assert_eq!(good["photo"]["position"], json!([8.25, 50.5, 150.0]));
+    assert!(good["photo"]["sharpness"].as_f64().unwrap() > 0.3, "{good}");
+    let blurred = image::imageops::blur(&picture(), 3.0);
+    let blurred = put(app, &survey, "blurred.jpg", photo(&blurred, 30)).await;
+    assert_eq!(codes(&blurred), ["blurred"], "{blurred}");
+    let mut dark = Cursor::new(Vec::new());
+    GrayImage::new(200, 200).write_to(&mut dark, image::ImageFormat::Png).unwrap();
+    let dark = put(app, &survey, "dark.png", dark.into_inner()).await;
+    assert_eq!(codes(&dark), ["underexposed", "no_position", "no_time"], "{dark}");
+    let again = put(app, &survey, "good again.jpg", photo(&picture(), 15)).await;
+    assert_eq!(codes(&again), ["duplicate"]);
+    assert!(again["warnings"][0]["message"].as_str().unwrap().contains("good.jpg"), "{again}");
+    survey
+}
+
+#[tokio::test]
+async fn every_photo_has_its_verdict_at_once_and_in_the_list() {
+    let app = App::new(&[]).await;
+    let survey = flown(&app).await;
+    let images = format!("{survey}/images");
+    assert_eq!(names(&app, &images).await, ["blurred.jpg", "dark.png", "good again.jpg", "good.jpg"]);
+    assert_eq!(names(&app, &format!("{images}?warning=duplicate")).await, ["good again.jpg", "good.jpg"]);
+    assert_eq!(names(&app, &format!("{images}?warning=blurred")).await, ["blurred.jpg"]);
+    assert_eq!(names(&app, &format!("{images}?reconstructed=false")).await, [""; 0]);
+
+    // Part by part, the filter kept.
+    let (mut next, mut seen) = (format!("{images}?warning=any&limit=1"), Vec::new());
+    loop {
+        let (_, part) = app.get(&next).await;
+        seen.extend(part["items"].as_array().unwrap().iter().map(|image| image["name"].as_str().unwrap().to_owned()));
+        match part["next"].as_str() {
+            Some(link) => next = link.to_owned(),
+            None => break,
+        }
+    }
+    assert_eq!(seen, ["blurred.jpg", "dark.png", "good again.jpg", "good.jpg"]);
+    for query in ["warning=ugly", "cursor=x", "limit=0", "limit=1001", "reconstructed=maybe", "unknown=1"] {
+        assert_problem(app.get(&format!("{images}?{query}")).await, 400, "invalid_query", "");
+    }
+}
+
+#[tokio::test]
+async fn photos_are_on_the_map() {
+    let app = App::new(&[]).await;
+    let survey = flown(&app).await;
+    let (status, map) = app.get(&format!("{survey}/images.geojson")).await;
+    assert_eq!((status, &map["type"]), (StatusCode::OK, &json!("FeatureCollection")), "{map}");
+    let features = map["features"].as_array().unwrap();
+    assert_eq!(features.len(), 3, "the dark one tells no position");
+    assert_eq!(features[0]["id"], "blurred.jpg");
+    assert_eq!(features[0]["geometry"], json!({"type": "Point", "coordinates": [8.5, 50.5, 150.0]}));
+    assert_eq!(features[0]["properties"]["warnings"], json!(["blurred"]));
+    assert_eq!(features[0]["properties"]["reconstructed"], Value::Null);
+}
+
+#[tokio::test]
+async fn a_survey_says_what_is_complete_and_what_is_missing() {
+    let app = App::new(&[]).await;
+    let survey = flown(&app).await;
+    let (_, told) = app.get(&survey).await;
+    let expected = json!({
+        "uploaded": 4, "with_position": 3, "with_warning": 4, "not_reconstructed": [], "not_uploaded": [],
+    });
+    assert_eq!(told["images"], expected);
+    let codes = |told: &Value| {
+        let missing = told["missing"].as_array().unwrap();
+        missing.iter().map(|missing| missing["code"].as_str().unwrap().to_owned()).collect::<Vec<_>>()
+    };
+    assert_eq!(codes(&told), ["no_reconstruction", "no_reference"]);
+
+    let reconstruction = json!([{"shots": {"good.jpg": {}, "lost.jpg": {}}}, {"shots": {"blurred.jpg": {"x": [1]}}}]);
+    for (path, body) in [("reconstruction.json", reconstruction), ("reference_lla.json", json!({"latitude": 50}))] {
+        let (status, answer) = app.put(&format!("{survey}/reconstruction/{path}"), body.to_string()).await;
+        assert_eq!(status, StatusCode::CREATED, "{answer}");
+    }
+    let (_, told) = app.get(&survey).await;
+    assert_eq!((&told["complete"], &codes(&told)[..]), (&json!(false), &["images_not_uploaded".to_owned()][..]));
+    assert_eq!(told["images"]["reconstructed"], 3);
+    assert_eq!(told["images"]["not_uploaded"], json!(["lost.jpg"]));
+    assert_eq!(told["images"]["not_reconstructed"], json!(["dark.png", "good again.jpg"]));
+    assert_problem(app.post(&format!("{survey}/jobs"), json!({})).await, 409, "survey_incomplete", "lost.jpg");
+    let used = format!("{survey}/images?reconstructed=true");
+    assert_eq!(names(&app, &used).await, ["blurred.jpg", "good.jpg"]);
+    // The undistorted image does as well as the photo.
+    let path = format!("{survey}/reconstruction/undistorted/images/lost.jpg");
+    assert_eq!(app.put(&path, photo(&picture(), 45)).await.0, StatusCode::CREATED);
+    assert_eq!(app.get(&survey).await.1["complete"], json!(true));
+}
+
+#[tokio::test]
+async fn a_photo_that_does_not_decode_is_refused() {
+    let app = App::new(&[]).await;
+    let survey = app.survey().await;
+    let mut broken = Cursor::new(Vec::new());
+    picture().write_to(&mut broken, image::ImageFormat::Png).unwrap();
+    let mut broken = broken.into_inner();
+    // The chunks are whole, what is in them is not.
+    let middle = broken.len() / 2;
+    broken[middle..middle + 64].fill(0xaa);
+    assert_problem(app.put(&format!("{survey}/images/a.png"), broken).await, 422, "image_unreadable", "images/a.png");
+}
