@@ -17,7 +17,7 @@ export ORT_DYLIB_PATH ?= $(abspath $(ORT_LIBRARY))
 HELIOMAP_DATA ?= $(wildcard ../shared/data)
 export HELIOMAP_DATA
 
-.PHONY: help setup web demo test lint unit kills tus structure bench scaling yolo-export openapi clean
+.PHONY: help setup web demo test lint unit client kills tus structure bench scaling yolo-export openapi clean
 
 help: ## List the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -50,6 +50,12 @@ lint: setup ## Formatting and lints, warnings are errors
 
 unit: setup ## Tests alone
 	tests/with-postgres.sh $(CARGO) test --locked
+	$(MAKE) --no-print-directory client
+
+client: setup ## The Python client and every command of docs/API.md against the real service
+	@command -v jq >/dev/null || { apt-get update -qq && apt-get install -qq --yes --no-install-recommends jq >/dev/null; }
+	$(CARGO) build --locked
+	$(PYTHON) -m unittest discover --start-directory tests/clients
 
 KILLS ?= 200
 kills: setup ## Kill server and worker at random (KILLS times): nothing is lost, models are those of a run without kills

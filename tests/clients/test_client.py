@@ -1,0 +1,125 @@
+"""The Python client against the real service."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import json
+import os
+import sys
+import tempfile
+import threading
+import unittest
+from pathlib import Path
+
+from service import ROOT, Service, lay_out_example
+
+sys.path.insert(0, str(ROOT / "clients" / "python"))
+from heliomap_client import Client, Problem, Unreachable, survey_files  # noqa: E402
+from heliomap_client import upload as uploading  # noqa: E402
+from heliomap_client.cli import main  # noqa: E402
+
+
+class ClientTest(unittest.TestCase):
+    def setUp(self) -> None:
+        self.folder = Path(self.enterContext(tempfile.TemporaryDirectory(prefix="heliomap-client-")))
+
+    def client(self, *arguments: str) -> Client:
+        self.service = self.enterContext(Service(self.folder / "data", *arguments))
+        return Client(self.service.url, self.service.key, timeout_s=30)
+
+    def test_a_folder_becomes_a_plant(self) -> None:
+        client = self.client()
+        survey = self.folder / "survey"
+        lay_out_example(survey)
+        target = self.folder / "plant.geojson"
+        arguments = ["map", str(survey), "--plant", "Sunfield", "--survey", "June", "--out", str(target)]
+        told = io.StringIO()
+        with contextlib.redirect_stdout(told):
+            status = main(["--url", self.service.url, "--key", self.service.key, *arguments])
+        self.assertEqual(status, 0, told.getvalue())
+        self.assertIn("succeeded", told.getvalue())
+        modules = json.loads(target.read_text())["features"]
+        counted = json.loads((survey / "truth.json").read_text())["counts"]["modules"]
+        self.assertEqual(len(modules), counted)
+
+        plant = next(client.plants())["id"]
+        model = next(client.models(plant))
+        self.assertEqual(model["version"], 1)
+        one = modules[0]
+        self.assertEqual(client.module(plant, one["id"])["properties"]["label"], one["properties"]["label"])
+        with self.assertRaises(Problem) as raised:
+            client.module(plant, plant)
+        self.assertEqual((raised.exception.status, raised.exception.code), (404, "module_not_found"))
+
+    def test_what_is_there_is_not_sent_again_and_what_is_wrong_is_told(self) -> None:
+        client = self.client("--no-worker")
+        survey = self.folder / "survey"
+        lay_out_example(survey)
+        (survey / "images" / "broken.jpg").write_bytes(b"no photo")
+        plant = client.create_plant("Sunfield")["id"]
+        here = client.create_survey(plant, "June")["id"]
+        first = client.upload_folder(plant, here, survey)
+        files = dict(survey_files(survey))
+        self.assertEqual(len(first.stored), len(files) - 1)
+        self.assertEqual({path: problem.code for path, problem in first.refused.items()}, {"images/broken.jpg": "image_unreadable"})
+        # The example's photos tell neither when nor where they were taken; nothing else is wrong with them.
+        codes = {warning["code"] for photo in first.warned for warning in photo["warnings"]}
+        self.assertEqual(codes, {"no_position", "no_time"})
+        again = client.upload_folder(plant, here, survey)
+        self.assertEqual((again.stored, again.skipped), ([], len(files) - 1))
+        stored = {file["path"]: file["sha256"] for file in client.survey(plant, here)["files"]}
+        files.pop("images/broken.jpg")
+        self.assertEqual(stored, {path: hashlib.sha256(file.read_bytes()).hexdigest() for path, file in files.items()})
+
+    def test_a_large_file_survives_kills_of_the_service_and_of_the_client(self) -> None:
+        client = self.client("--no-worker")
+        survey = self.folder / "survey"
+        (survey / "undistorted" / "depthmaps").mkdir(parents=True)
+        cloud = survey / "undistorted" / "depthmaps" / "merged.ply"
+        cloud.write_bytes(b"ply\n" + os.urandom(uploading.RESUMED_BYTES + (8 << 20)))
+        plant = client.create_plant("Sunfield")["id"]
+        here = client.create_survey(plant, "June")["id"]
+
+        # A client that gives up at once stands for one that is killed; it leaves an address behind.
+        self.service.kill()
+        with self.assertRaises(Unreachable):
+            Client(self.service.url, self.service.key, tries=1).upload_folder(plant, here, survey)
+        self.service.start()
+        state = survey / uploading.STATE_FILE
+        digest = hashlib.sha256(cloud.read_bytes()).hexdigest()
+        place = f"/api/v1/plants/{plant}/surveys/{here}"
+        headers = {**uploading.TUS, "Upload-Length": str(cloud.stat().st_size), "Upload-Metadata": "path dW5kaXN0b3J0ZWQvZGVwdGhtYXBzL21lcmdlZC5wbHk="}
+        with client.open("POST", f"{place}/uploads", headers=headers, body=lambda: b"") as answer:
+            url = answer.headers["Location"]
+        begun = 5 << 20
+        headers = {**uploading.TUS, "Upload-Offset": "0", "Content-Type": "application/offset+octet-stream"}
+        client.open("PATCH", url, headers=headers, body=lambda: cloud.read_bytes()[:begun]).close()
+        state.write_text(json.dumps({f"{place} undistorted/depthmaps/merged.ply": [url, digest]}))
+
+        # The service dies while the rest is on its way, and comes back.
+        def restart() -> None:
+            self.service.kill()
+            self.service.start()
+
+        killer = threading.Timer(0.05, restart)
+        killer.start()
+        report = client.upload_folder(plant, here, survey)
+        killer.join()
+        self.assertEqual([file["sha256"] for file in report.stored], [digest])
+        self.assertFalse(state.exists())
+        self.assertEqual(client.open("HEAD", url, headers=uploading.TUS).headers["Upload-Offset"], str(cloud.stat().st_size))
+
+    def test_a_key_that_is_not_good_is_told_at_once(self) -> None:
+        self.client("--no-worker")
+        stranger = Client(self.service.url, "hm_wrong")
+        with self.assertRaises(Problem) as raised:
+            stranger.create_plant("x")
+        self.assertEqual(raised.exception.code, "unauthorized")
+        with self.assertRaises(ValueError):
+            Client("127.0.0.1")
+
+
+if __name__ == "__main__":
+    unittest.main()
