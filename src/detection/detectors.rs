@@ -2,7 +2,7 @@
 
 use super::mask_to_boxes::ModuleBox;
 use super::merge::merge;
-use super::{Detection, DetectionError, Detector, Unet, Yolo, filter, lattice, registration};
+use super::{Detection, DetectionError, Detector, Unet, Yolo, filter, lattice, periodicity, registration};
 use crate::geometry::Quad;
 use image::RgbImage;
 use nalgebra::Vector2;
@@ -37,6 +37,26 @@ pub(super) fn detect(
     if width == 0 || height == 0 {
         return Ok(Vec::new());
     }
+    let mut boxes = search(unet, yolo, image, gsd_m)?;
+    let is_enlarged = unet.is_some_and(|unet| unet.enlarges(gsd_m)) || yolo.is_some_and(|yolo| yolo.enlarges(gsd_m));
+    if is_enlarged {
+        // Enlarging a coarse photo helps where seams are faint, and harms where they are blurred.
+        let as_taken = search(unet, yolo, image, None)?;
+        if area_in_lattices_px2(&as_taken) > area_in_lattices_px2(&boxes) {
+            boxes = as_taken;
+        }
+    }
+    registration::register(&mut boxes, image)?;
+    Ok(boxes.iter().filter_map(detection).filter(|d| filter::is_inside_frame(&d.quad.corners, width, height)).collect())
+}
+
+/// The boxes of an image that is taken to have a ground sampling distance; those that the frame cuts are among them.
+fn search(
+    unet: Option<&Unet>,
+    yolo: Option<&Yolo>,
+    image: &RgbImage,
+    gsd_m: Option<f64>,
+) -> Result<Vec<ModuleBox>, DetectionError> {
     let (foundation, seen) = match unet {
         Some(unet) => {
             let (boxes, seen) = unet.search(image, gsd_m)?;
@@ -46,14 +66,21 @@ pub(super) fn detect(
     };
     let complement = yolo.map(|yolo| yolo.search(image, gsd_m)).transpose()?.unwrap_or_default();
     let evidence = seen.as_ref().map(|seen| seen as &dyn lattice::Evidence);
-    let size = Vector2::new(f64::from(width), f64::from(height));
+    let size = Vector2::new(f64::from(image.width()), f64::from(image.height()));
     // Each network's boxes in their own lattices first: the less exact must not disturb the more exact.
     let foundation = lattice::complete(foundation, evidence, size);
     let complement = lattice::complete(complement, None, size);
     let shows = |b: &ModuleBox| evidence.is_none_or(|evidence| lattice::face(b, evidence) > TRACE);
-    let mut boxes = filter::supported(merge(foundation, complement, shows));
-    registration::register(&mut boxes, image)?;
-    Ok(boxes.iter().filter_map(detection).filter(|d| filter::is_inside_frame(&d.quad.corners, width, height)).collect())
+    let boxes = filter::supported(merge(foundation, complement, shows));
+    Ok(match &seen {
+        Some(seen) => periodicity::part_benches(boxes, &seen.view(image)),
+        None => boxes,
+    })
+}
+
+/// How much of the image the boxes cover that stand in lattices.
+fn area_in_lattices_px2(boxes: &[ModuleBox]) -> f64 {
+    lattice::grouped(boxes).iter().flatten().map(|&(_, index)| boxes[index].area_px2()).sum()
 }
 
 fn detection(b: &ModuleBox) -> Option<Detection> {

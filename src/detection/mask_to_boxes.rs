@@ -91,22 +91,22 @@ impl ModuleBox {
 
 /// A horizontal stretch of pixels, `x0..x1`.
 #[derive(Debug, Clone, Copy)]
-struct Run {
-    y: usize,
-    x0: usize,
-    x1: usize,
+pub(super) struct Run {
+    pub y: usize,
+    pub x0: usize,
+    pub x1: usize,
 }
 
 /// The 4-connected components of what lies above a threshold, each as its runs from top to bottom and left to right;
 /// the components in the order of their first pixels.
-struct Components {
+pub(super) struct Components {
     runs: Vec<Run>,
     starts: Vec<usize>,
 }
 
 impl Components {
     /// Of the pixels whose stored value is above `level`.
-    fn above(map: &ProbabilityMap, level: u16) -> Self {
+    pub fn above(map: &ProbabilityMap, level: u16) -> Self {
         let mut runs: Vec<Run> = Vec::new();
         let mut parents: Vec<usize> = Vec::new();
         let mut previous_row = 0..0;
@@ -156,7 +156,7 @@ impl Components {
     }
 
     /// The runs of each component that is no speck.
-    fn iter(&self) -> impl Iterator<Item = &[Run]> {
+    pub fn iter(&self) -> impl Iterator<Item = &[Run]> {
         self.starts
             .windows(2)
             .map(|ends| &self.runs[ends[0]..ends[1]])

@@ -12,6 +12,8 @@ pub mod mask_to_boxes;
 mod merge;
 mod neighbours;
 mod open;
+mod outline;
+mod periodicity;
 pub mod probability;
 mod registration;
 pub mod runtime;

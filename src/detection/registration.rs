@@ -209,7 +209,7 @@ impl Patch {
 }
 
 /// Means over `2 reach + 1` samples along one axis (samples `stride` apart), fewer at the ends.
-fn blurred(values: &[f64], columns: usize, reach: usize, stride: usize) -> Vec<f64> {
+pub(super) fn blurred(values: &[f64], columns: usize, reach: usize, stride: usize) -> Vec<f64> {
     let (lines, length) =
         if stride == 1 { (values.len() / columns, columns) } else { (columns, values.len() / columns) };
     let mut out = vec![0.0; values.len()];
@@ -224,7 +224,7 @@ fn blurred(values: &[f64], columns: usize, reach: usize, stride: usize) -> Vec<f
 }
 
 /// Grey value at a place of the image, bilinear; `None` outside.
-fn grey(image: &RgbImage, at: Vector2<f64>) -> Option<f64> {
+pub(super) fn grey(image: &RgbImage, at: Vector2<f64>) -> Option<f64> {
     let (width, height) = image.dimensions();
     if !(at.x >= 0.0 && at.y >= 0.0 && at.x < f64::from(width) - 1.0 && at.y < f64::from(height) - 1.0) {
         return None;

@@ -2,6 +2,7 @@
 
 use super::lattice::Evidence;
 use super::mask_to_boxes::{self, ModuleBox};
+use super::periodicity::View;
 use super::probability::ProbabilityMap;
 use super::runtime::{self, ImageModel, RuntimeSettings, extract, run};
 use super::tiles::{Beyond, Tile, WorkingRange, fill, resample, tiles};
@@ -50,6 +51,13 @@ impl Seen {
     fn sample(&self, map: &ProbabilityMap, at: Vector2<f64>) -> f64 {
         let half = Vector2::repeat(0.5);
         map.at((at + half).component_div(&self.pixel) - half)
+    }
+}
+
+impl Seen {
+    /// The image beside what was said of it.
+    pub(super) fn view<'a>(&'a self, image: &'a RgbImage) -> View<'a> {
+        View { image, module: &self.masks.module, core: self.masks.core.as_ref(), pixel: self.pixel }
     }
 }
 
@@ -200,6 +208,11 @@ impl Unet {
             }
         }
         Ok(())
+    }
+
+    /// Whether an image of the given ground sampling distance (metres per pixel) is too coarse for the network as it is.
+    pub(super) fn enlarges(&self, gsd_m: Option<f64>) -> bool {
+        self.working_range.scale(gsd_m) > 1.0
     }
 
     /// The modules of an image as boxes in its pixels; those that the frame cuts are among them.

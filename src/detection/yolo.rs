@@ -118,6 +118,11 @@ impl Yolo {
         Ok(Self { version: model.version(), boxes, prototypes, classes, coefficients, wanted, working_range, model })
     }
 
+    /// Whether an image of the given ground sampling distance (metres per pixel) is too coarse for the network as it is.
+    pub(super) fn enlarges(&self, gsd_m: Option<f64>) -> bool {
+        self.working_range.scale(gsd_m) > 1.0
+    }
+
     /// The modules of an image as boxes in its pixels, the best first; those that the frame cuts are among them.
     pub(super) fn search(&self, image: &RgbImage, gsd_m: Option<f64>) -> Result<Vec<ModuleBox>, DetectionError> {
         let (width, height) = image.dimensions();

@@ -1,0 +1,608 @@
+//! Benches whose seams no network sees, parted by what repeats in the photo.
+//!
+//! The bright cell grid of some modules is stronger than the seams between them: the mask of faces then covers a bench well,
+//! but no core falls out of it. Yet modules are alike, so that the bench repeats itself from module to module and from row to
+//! row: of all periods that a bench may have by its outline, the true one explains most of what is seen, cells, busbars, seams
+//! and all. Benches of one photo hold the same modules, and decide together which periods these are.
+
+use super::Source;
+use super::filter::OVERLAP;
+use super::mask_to_boxes::{Components, ModuleBox, middle};
+use super::outline::{FACE, Outline};
+use super::probability::ProbabilityMap;
+use super::registration::{blurred, grey};
+use crate::geometry::Quad;
+use image::RgbImage;
+use nalgebra::{Matrix3, SMatrix, SVector, Vector2, Vector3};
+use rayon::prelude::*;
+
+/// Fewest pixels of an area that is looked at, and the least length and width of its outline.
+const LEAST_AREA: usize = 1000;
+const LEAST_SIZE: (usize, usize) = (20, 8);
+/// Part of a bench that boxes must cover for it to be left to them.
+const COVERED: f64 = 0.85;
+/// Least part of an outline that is covered by faces.
+const FILLED: f64 = 0.85;
+/// Length of a module's short side in pixels of the mask, and of its long side in parts of that, as photos show them.
+const SHORT_PX: (f64, f64) = (9.0, 46.0);
+const ELONGATION: (f64, f64) = (1.25, 3.2);
+/// Half the length, in pixels, over which light and colour are taken out.
+const COARSE_PX: usize = 15;
+/// How far the ends of an outline may be off, in pixels of its length, and in which steps.
+const END_PX: i32 = 6;
+const END_STEP_PX: f64 = 0.5;
+/// Step between periods where one end is open: by so many pixels the last module moves.
+const OPEN_STEP_PX: f64 = 0.7;
+/// The best periods of an axis, and the best pairs of both axes, that are weighed.
+const MOST_PERIODS: usize = 40;
+const MOST_PATTERNS: usize = 400;
+/// Twice the period explains as much: what a period must explain more for each doubling of the module's area.
+const DOUBLING: f64 = 0.06;
+/// Area in square pixels that neither gains nor loses by that.
+const USUAL_AREA_PX2: f64 = 600.0;
+/// Largest difference of the logarithms of sides of modules of one photo that are taken for the same, and that perspective
+/// leaves between benches.
+const SAME: f64 = 0.12;
+const ALIKE: f64 = 0.15;
+/// What a pattern explains beyond this speaks for it, and what a bench well covered by boxes says for theirs.
+const NOTHING: f64 = 0.1;
+const BY_BOXES: f64 = 1.0;
+/// How many of a bench's patterns are put forward for the photo.
+const PUT_FORWARD: usize = 20;
+/// Least explained share per axis; of the only axis where a bench has one row; and least lead over another count.
+const EXPLAINED: f64 = 0.2;
+const EXPLAINED_ALONE: f64 = 0.4;
+const LEAD: f64 = 0.15;
+/// The same once other benches of the photo have told the sides, and how far these may then differ.
+const CLOSE: f64 = 0.08;
+const CLOSE_LEAD: f64 = 0.08;
+/// Fewest columns of a bench of one row.
+const LEAST_COLUMNS: f64 = 6.0;
+/// Difference of counts at which the end of a bench is another module's.
+const OTHER_COUNT: f64 = 0.6;
+/// How far a whole bench may bend its pattern, and the end of an open one shift it, in modules; and the steps.
+const BENT: f64 = 0.5;
+const BENT_STEP: f64 = 0.05;
+/// A module of which the mask covers less of the middle is a hole.
+const PRESENT: f64 = 0.6;
+/// Edge of a module in parts of the pitch.
+const FACE_OF_PITCH: f64 = 0.985;
+
+/// The photo and what the network said of it.
+pub(super) struct View<'a> {
+    pub image: &'a RgbImage,
+    pub module: &'a ProbabilityMap,
+    pub core: Option<&'a ProbabilityMap>,
+    /// Pixels of the image per pixel of the maps.
+    pub pixel: Vector2<f64>,
+}
+
+/// How one axis of a bench repeats itself.
+#[derive(Debug, Clone, Copy)]
+struct Period {
+    px: f64,
+    /// Modules along the axis; a whole number where both ends are seen.
+    count: f64,
+    /// Share of the variance that it explains, adjusted for its freedom.
+    explained: f64,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Pattern {
+    along: Period,
+    across: Period,
+    score: f64,
+}
+
+impl Pattern {
+    /// Logarithms of the shorter and the longer side.
+    fn sides(&self) -> Vector2<f64> {
+        let (along, across) = (self.along.px.ln(), self.across.px.ln());
+        Vector2::new(along.min(across), along.max(across))
+    }
+}
+
+/// A bench that boxes do not cover.
+struct Bench {
+    outline: Outline,
+    raster: Raster,
+    area_px2: f64,
+    patterns: Vec<Pattern>,
+}
+
+/// The boxes, in pixels of the image; those of benches that they cover badly replaced by what repeats there, where that is
+/// plain.
+pub(super) fn part_benches(boxes: Vec<ModuleBox>, view: &View) -> Vec<ModuleBox> {
+    let to_map = view.pixel.map(|pixel| 1.0 / pixel);
+    let scaled: Vec<ModuleBox> = boxes.iter().map(|b| b.scaled(to_map)).collect();
+    let components = Components::above(view.module, ProbabilityMap::level(FACE));
+    let areas: Vec<_> = components
+        .iter()
+        .map(|runs| (runs, runs.iter().map(|run| run.x1 - run.x0).sum::<usize>()))
+        .filter(|(_, area)| *area >= LEAST_AREA)
+        .collect();
+    let mut votes: Vec<(Vector2<f64>, f64)> = Vec::new();
+    let mut open: Vec<(Outline, f64)> = Vec::new();
+    for (runs, area) in areas {
+        let Some(outline) = Outline::of(view.module, runs) else { continue };
+        let quad = Quad { corners: outline.corners };
+        let own: Vec<&ModuleBox> = scaled.iter().filter(|b| quad.contains(b.center)).collect();
+        let area_px2 = area as f64;
+        if own.iter().map(|b| b.area_px2()).sum::<f64>() > COVERED * area_px2 {
+            let side = |of: fn(&ModuleBox) -> Vector2<f64>| middle(own.iter().map(|b| of(b).norm())).ln();
+            votes.push((Vector2::new(side(|b| b.v), side(|b| b.u)), BY_BOXES * area_px2.sqrt()));
+        } else {
+            open.push((outline, area_px2));
+        }
+    }
+    let benches: Vec<Bench> =
+        open.into_par_iter().filter_map(|(outline, area_px2)| Bench::of(outline, area_px2, view)).collect();
+    let Some(sides) = elect(&benches, &votes) else { return boxes };
+    let mut kept = boxes;
+    for (bench, pattern) in decided(&benches, sides) {
+        let found: Vec<ModuleBox> = bench.modules(&pattern, view).into_iter().map(|b| b.scaled(view.pixel)).collect();
+        let crosses = |b: &ModuleBox| {
+            let quad = b.quad();
+            found.iter().any(|own| {
+                (own.center - b.center).norm() < own.u.norm().max(b.u.norm())
+                    && quad.overlap_px2(&own.quad()) > OVERLAP * own.area_px2().min(b.area_px2())
+            })
+        };
+        kept.retain(|b| !crosses(b));
+        kept.extend(found);
+    }
+    kept
+}
+
+/// The logarithms of the sides that most of the photo speaks for.
+fn elect(benches: &[Bench], votes: &[(Vector2<f64>, f64)]) -> Option<Vector2<f64>> {
+    let is_same = |a: Vector2<f64>, b: Vector2<f64>| (a - b).amax() < SAME;
+    let put_forward = benches.iter().flat_map(|bench| bench.patterns.iter().take(PUT_FORWARD).map(Pattern::sides));
+    let mut best: Option<(f64, Vector2<f64>)> = None;
+    for sides in put_forward {
+        let from_benches = benches.iter().filter_map(|bench| {
+            let own = bench.patterns.iter().find(|pattern| is_same(pattern.sides(), sides))?;
+            Some((own.score - NOTHING).max(0.0) * bench.area_px2.sqrt())
+        });
+        let from_boxes = votes.iter().filter(|(voted, _)| is_same(*voted, sides)).map(|(_, weight)| *weight);
+        let total: f64 = from_benches.chain(from_boxes).sum();
+        if best.is_none_or(|(most, _)| total > most) {
+            best = Some((total, sides));
+        }
+    }
+    best.map(|(_, sides)| sides)
+}
+
+/// The benches whose pattern is plain by itself, and those that are plain once the sides of modules are known closely.
+fn decided(benches: &[Bench], sides: Vector2<f64>) -> Vec<(&Bench, Pattern)> {
+    let plain = |bench: &Bench| bench.plain(sides, ALIKE, LEAD);
+    let known: Vec<Vector2<f64>> = benches.iter().filter_map(|bench| Some(plain(bench)?.sides())).collect();
+    let side = |k: usize| middle(known.iter().map(|sides| sides[k]));
+    let closely = Vector2::new(side(0), side(1));
+    let decide =
+        |bench| plain(bench).or_else(|| if known.is_empty() { None } else { bench.plain(closely, CLOSE, CLOSE_LEAD) });
+    benches.iter().filter_map(|bench| Some((bench, decide(bench)?))).collect()
+}
+
+impl Bench {
+    fn of(outline: Outline, area_px2: f64, view: &View) -> Option<Self> {
+        let raster = Raster::of(&outline, view)?;
+        let (along, across) = (raster.profile(true), raster.profile(false));
+        let along = along.periods(outline.is_whole);
+        let across = across.periods(true);
+        let mut patterns = Vec::new();
+        for &along in &along {
+            for &across in &across {
+                let (short, long) = (along.px.min(across.px), along.px.max(across.px));
+                let is_module = (SHORT_PX.0..=SHORT_PX.1).contains(&short)
+                    && (ELONGATION.0..=ELONGATION.1).contains(&(long / short));
+                if is_module && (across.count > 1.0 || along.count >= LEAST_COLUMNS) {
+                    let doublings = (short * long / USUAL_AREA_PX2).log2();
+                    let score = along.explained + across.explained - DOUBLING * doublings;
+                    patterns.push(Pattern { along, across, score });
+                }
+            }
+        }
+        patterns.sort_by(|a, b| b.score.total_cmp(&a.score));
+        patterns.truncate(MOST_PATTERNS);
+        Some(Self { outline, raster, area_px2, patterns })
+    }
+
+    /// The best pattern of modules with these sides, but for `tolerance`, where it leads by `lead`.
+    fn plain(&self, sides: Vector2<f64>, tolerance: f64, lead: f64) -> Option<Pattern> {
+        let alike = || self.patterns.iter().filter(|pattern| (pattern.sides() - sides).amax() < tolerance);
+        let best = alike().next()?;
+        let is_other = |other: &&Pattern| {
+            other.across.count != best.across.count || (other.along.count - best.along.count).abs() > OTHER_COUNT
+        };
+        let rival = alike().find(is_other).map_or(NOTHING, |rival| rival.score);
+        let is_explained = if best.across.count > 1.0 {
+            best.along.explained > EXPLAINED && best.across.explained > EXPLAINED
+        } else {
+            best.along.explained > EXPLAINED_ALONE
+        };
+        (is_explained && best.score - rival > lead).then_some(*best)
+    }
+
+    /// The modules of a pattern that the mask shows, in pixels of the maps.
+    fn modules(&self, pattern: &Pattern, view: &View) -> Vec<ModuleBox> {
+        let columns = self.raster.profile(true).places(&pattern.along, self.outline.is_whole);
+        let rows = self.raster.profile(false).places(&pattern.across, true);
+        let mut found = Vec::new();
+        for column in columns.windows(2) {
+            for row in rows.windows(2) {
+                let corner = |x: f64, y: f64| self.raster.place(Vector2::new(x, y));
+                let [a, b, c, d] = [
+                    corner(column[0], row[0]),
+                    corner(column[1], row[0]),
+                    corner(column[1], row[1]),
+                    corner(column[0], row[1]),
+                ];
+                let (along, across) =
+                    ((b - a + c - d) * (FACE_OF_PITCH / 2.0), (d - a + c - b) * (FACE_OF_PITCH / 2.0));
+                let (u, v) = if along.norm() > across.norm() { (along, across) } else { (across, along) };
+                let center = (a + b + c + d) / 4.0;
+                let score = middle_face(view.module, center, u, v);
+                if score > PRESENT {
+                    found.push(ModuleBox { center, u, v, score: score as f32, source: Source::Unet });
+                }
+            }
+        }
+        found
+    }
+}
+
+/// Mean probability of a face over the middle of a module.
+fn middle_face(module: &ProbabilityMap, center: Vector2<f64>, u: Vector2<f64>, v: Vector2<f64>) -> f64 {
+    let place = |k: usize| (k as f64 - 2.0) * 0.15;
+    (0..25).map(|k| module.at(center + u * place(k % 5) + v * place(k / 5))).sum::<f64>() / 25.0
+}
+
+/// A bench made upright: about one sample per pixel of the maps.
+struct Raster {
+    columns: usize,
+    rows: usize,
+    from_raster: Matrix3<f64>,
+    /// Grey value and core probability (nought where the network knows no cores); `None` where no face or no photo is.
+    samples: Vec<Option<Vector2<f64>>>,
+    has_cores: bool,
+}
+
+impl Raster {
+    fn of(outline: &Outline, view: &View) -> Option<Self> {
+        let [a, b, c, d] = outline.corners;
+        let columns = (((b - a).norm() + (c - d).norm()) / 2.0).round() as usize;
+        let rows = (((d - a).norm() + (c - b).norm()) / 2.0).round() as usize;
+        let most = view.module.width() + view.module.height();
+        if columns < LEAST_SIZE.0 || rows < LEAST_SIZE.1 || columns > most || rows > most {
+            return None;
+        }
+        let from_raster = homography(columns as f64, rows as f64, &outline.corners)?;
+        let mut raster = Self {
+            columns,
+            rows,
+            from_raster,
+            samples: Vec::with_capacity(columns * rows),
+            has_cores: view.core.is_some(),
+        };
+        let size = Vector2::new(view.module.width() as f64, view.module.height() as f64);
+        let mut in_view = 0_usize;
+        for row in 0..rows {
+            for column in 0..columns {
+                let at = raster.place(Vector2::new(column as f64 + 0.5, row as f64 + 0.5));
+                let is_in_view = at.x >= 0.0 && at.y >= 0.0 && at.x <= size.x - 1.0 && at.y <= size.y - 1.0;
+                in_view += usize::from(is_in_view);
+                let is_face = is_in_view && view.module.at(at) > f64::from(FACE);
+                let core = || view.core.map_or(0.0, |core| core.at(at));
+                let sample = if is_face { view.grey(at).map(|grey| Vector2::new(grey, core())) } else { None };
+                raster.samples.push(sample);
+            }
+        }
+        let faces = raster.samples.iter().flatten().count();
+        (faces as f64 > FILLED * in_view as f64).then_some(raster)
+    }
+
+    /// A place of the raster in pixels of the maps.
+    fn place(&self, at: Vector2<f64>) -> Vector2<f64> {
+        let p = self.from_raster * Vector3::new(at.x, at.y, 1.0);
+        p.xy() / p.z
+    }
+
+    /// Means over the rows (`along`) or over the columns, less what changes slowly.
+    fn profile(&self, along: bool) -> Profile {
+        let length = if along { self.columns } else { self.rows };
+        let mut sums = vec![Vector3::zeros(); length];
+        for (index, sample) in self.samples.iter().enumerate() {
+            if let Some(sample) = sample {
+                sums[if along { index % self.columns } else { index / self.columns }] += sample.push(1.0);
+            }
+        }
+        let most = sums.iter().map(|sum| sum.z).fold(0.0, f64::max);
+        // The ends show the edge of the bench.
+        let is_seen: Vec<bool> = (0..length).map(|k| sums[k].z > 0.3 * most && (2..length - 2).contains(&k)).collect();
+        let channel = |k: usize| {
+            let known = sums.iter().filter(|sum| sum.z > 0.0);
+            let mean = known.clone().map(|sum| sum[k] / sum.z).sum::<f64>() / known.count().max(1) as f64;
+            let values: Vec<f64> = sums.iter().map(|sum| if sum.z > 0.0 { sum[k] / sum.z } else { mean }).collect();
+            let slow = blurred(&values, length, COARSE_PX, 1);
+            values.iter().zip(slow).map(|(value, slow)| value - slow).collect()
+        };
+        let mut channels = vec![channel(0)];
+        if self.has_cores {
+            channels.push(channel(1));
+        }
+        Profile { is_seen, channels }
+    }
+}
+
+/// What a bench shows along one axis.
+struct Profile {
+    is_seen: Vec<bool>,
+    channels: Vec<Vec<f64>>,
+}
+
+impl Profile {
+    fn length(&self) -> f64 {
+        self.is_seen.len() as f64
+    }
+
+    /// The share of the variance that repeats itself with the phase (in modules) of each place, adjusted for the number of
+    /// means that tell it.
+    fn explained(&self, period_px: f64, phase: impl Fn(f64) -> f64) -> f64 {
+        let bins = (period_px.round() as usize).max(8);
+        let places: Vec<(usize, usize)> = (0..self.is_seen.len())
+            .filter(|&k| self.is_seen[k])
+            .map(|k| (k, ((phase(k as f64 + 0.5).rem_euclid(1.0) * bins as f64) as usize).min(bins - 1)))
+            .collect();
+        let mut counts = vec![0.0_f64; bins];
+        for &(_, bin) in &places {
+            counts[bin] += 1.0;
+        }
+        let freedom = counts.iter().filter(|count| **count > 0.0).count() + 1;
+        if places.len() <= freedom {
+            return 0.0;
+        }
+        let share = |values: &Vec<f64>| {
+            let mut means = vec![0.0; bins];
+            for &(k, bin) in &places {
+                means[bin] += values[k] / counts[bin];
+            }
+            let rest: f64 = places.iter().map(|&(k, bin)| (values[k] - means[bin]).powi(2)).sum();
+            let whole: f64 = places.iter().map(|&(k, _)| values[k].powi(2)).sum();
+            if whole > 0.0 { rest / whole } else { 1.0 }
+        };
+        let left = self.channels.iter().map(share).sum::<f64>() / self.channels.len() as f64;
+        1.0 - left * (places.len() - 1) as f64 / (places.len() - freedom) as f64
+    }
+
+    /// The periods that explain most, best first. Where the axis is whole, it holds a whole number of modules.
+    fn periods(&self, is_whole: bool) -> Vec<Period> {
+        let (length, longest) = (self.length(), SHORT_PX.1 * ELONGATION.1);
+        let mut found: Vec<Period> = Vec::new();
+        if is_whole {
+            for count in 1..=(length / SHORT_PX.0) as usize {
+                let count = count as f64;
+                if length / count > longest {
+                    continue;
+                }
+                let ends = (-END_PX..=END_PX).map(|step| length + f64::from(step) * END_STEP_PX);
+                let tried = ends.map(|end| {
+                    let px = end / count;
+                    let explained = if count > 1.0 { self.explained(px, |x| x / px) } else { 0.0 };
+                    Period { px, count, explained }
+                });
+                found.extend(tried.max_by(|a, b| a.explained.total_cmp(&b.explained)));
+            }
+        } else {
+            let steps = ((longest.min(length / 2.0) / SHORT_PX.0).ln() * length / OPEN_STEP_PX).max(0.0) as usize;
+            let tried: Vec<Period> = (0..steps)
+                .map(|step| SHORT_PX.0 * (step as f64 * OPEN_STEP_PX / length).exp())
+                .map(|px| Period { px, count: length / px, explained: self.explained(px, |x| x / px) })
+                .collect();
+            found.extend(tried.windows(3).filter_map(|near| {
+                let [before, own, after] = near else { return None };
+                (own.explained >= before.explained && own.explained >= after.explained).then_some(*own)
+            }));
+        }
+        found.sort_by(|a, b| b.explained.total_cmp(&a.explained));
+        found.truncate(MOST_PERIODS);
+        found
+    }
+
+    /// Where modules begin and end along the axis, from its start: the period, bent and, where the end is open, stretched so
+    /// that it explains most, for perspective and the lens leave no pitch quite even.
+    fn places(&self, period: &Period, is_whole: bool) -> Vec<f64> {
+        let (length, count) = (self.length(), period.count);
+        let phase = |x: f64, stretch: f64, bend: f64| {
+            let part = x / length;
+            x / period.px + stretch * part + bend * part * (part - 1.0)
+        };
+        let most = (BENT / BENT_STEP) as i32;
+        let range = || (-most..=most).map(|step| f64::from(step) * BENT_STEP);
+        let mut best = (f64::NEG_INFINITY, 0.0, 0.0);
+        for stretch in range().filter(|stretch| !is_whole || *stretch == 0.0) {
+            for bend in range() {
+                // Straight unless the photo says otherwise.
+                let explained =
+                    self.explained(period.px, |x| phase(x, stretch, bend)) - 1e-3 * (stretch.abs() + bend.abs());
+                if explained > best.0 {
+                    best = (explained, stretch, bend);
+                }
+            }
+        }
+        let (_, stretch, bend) = best;
+        let last = if is_whole { count.round() } else { (count + stretch + 0.15).floor() } as usize;
+        let place = |module: usize| {
+            let mut x = module as f64 * period.px;
+            for _ in 0..4 {
+                x -= (phase(x, stretch, bend) - module as f64) * period.px;
+            }
+            if is_whole { x * length / (count * period.px) } else { x }
+        };
+        (0..=last).map(place).collect()
+    }
+}
+
+impl View<'_> {
+    /// Grey value at a place of the maps: the mean over the pixel of the map; `None` outside of the photo.
+    fn grey(&self, at: Vector2<f64>) -> Option<f64> {
+        let half = Vector2::repeat(0.5);
+        let fine = self.pixel.x.max(self.pixel.y).ceil().clamp(1.0, 4.0) as usize;
+        let part = |k: usize| (k as f64 + 0.5) / fine as f64 - 0.5;
+        let mut sum = 0.0;
+        for k in 0..fine * fine {
+            let at = at + Vector2::new(part(k % fine), part(k / fine));
+            sum += grey(self.image, (at + half).component_mul(&self.pixel) - half)?;
+        }
+        Some(sum / (fine * fine) as f64)
+    }
+}
+
+/// The homography from a rectangle of the given size, its first corner at the origin, to a quadrilateral.
+fn homography(width: f64, height: f64, corners: &[Vector2<f64>; 4]) -> Option<Matrix3<f64>> {
+    let from = [(0.0, 0.0), (width, 0.0), (width, height), (0.0, height)];
+    let (mut matrix, mut right) = (SMatrix::<f64, 8, 8>::zeros(), SVector::<f64, 8>::zeros());
+    for (k, ((x, y), to)) in from.into_iter().zip(corners).enumerate() {
+        let rows = [[x, y, 1.0, 0.0, 0.0, 0.0, -x * to.x, -y * to.x], [0.0, 0.0, 0.0, x, y, 1.0, -x * to.y, -y * to.y]];
+        for (axis, row) in rows.into_iter().enumerate() {
+            matrix.row_mut(2 * k + axis).copy_from_slice(&row);
+            right[2 * k + axis] = to[axis];
+        }
+    }
+    let h = matrix.lu().solve(&right)?;
+    let found = Matrix3::new(h[0], h[1], h[2], h[3], h[4], h[5], h[6], h[7], 1.0);
+    found.iter().all(|value| value.is_finite()).then_some(found)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SIZE: (u32, u32) = (520, 300);
+    const COLUMNS: usize = 14;
+    const ROWS: usize = 3;
+
+    /// The modules of a bench in perspective, portrait, with all their corners.
+    fn modules() -> Vec<Quad> {
+        let seen = |x: f64, y: f64| {
+            let far = 1.0 + 0.0002 * x + 0.0003 * y;
+            Vector2::new(40.3 + (0.96 * x - 0.25 * y) / far, 30.2 + (0.27 * x + 0.93 * y) / far)
+        };
+        (0..ROWS * COLUMNS)
+            .map(|k| {
+                let (x, y) = (30.0 * (k % COLUMNS) as f64, 51.0 * (k / COLUMNS) as f64);
+                Quad { corners: [seen(x, y), seen(x + 30.0, y), seen(x + 30.0, y + 51.0), seen(x, y + 51.0)] }
+            })
+            .collect()
+    }
+
+    fn mean_of_9(x: usize, y: usize, value: impl Fn(Vector2<f64>) -> f64) -> f64 {
+        let fine = |k: usize| (k as f64 - 1.0) / 3.0;
+        (0..9).map(|k| value(Vector2::new(x as f64 + fine(k % 3), y as f64 + fine(k / 3)))).sum::<f64>() / 9.0
+    }
+
+    /// A mask that covers all modules and shows no seam.
+    fn mask(modules: &[Quad], width: u32) -> ProbabilityMap {
+        ProbabilityMap::from_fn(width as usize, SIZE.1 as usize, |x, y| {
+            mean_of_9(x, y, |at| f64::from(u8::from(modules.iter().any(|quad| quad.contains(at))))) as f32
+        })
+    }
+
+    /// A photo of modules whose cell grid is far brighter than their dark seams.
+    fn photo(modules: &[Quad], width: u32, grid: f64) -> RgbImage {
+        let inverse: Vec<Matrix3<f64>> =
+            modules.iter().map(|quad| homography(4.0, 6.0, &quad.corners).unwrap().try_inverse().unwrap()).collect();
+        RgbImage::from_fn(width, SIZE.1, |x, y| {
+            let value = mean_of_9(x as usize, y as usize, |at| {
+                let Some(index) = modules.iter().position(|quad| quad.contains(at)) else { return 130.0 };
+                let p = inverse[index] * Vector3::new(at.x, at.y, 1.0);
+                let cell = p.xy() / p.z;
+                let border = cell.x.min(4.0 - cell.x).min(cell.y).min(6.0 - cell.y);
+                // Frames and the margins within push the cells together.
+                let line = |value: f64, count: f64| {
+                    let cell = (value - 0.25) * count / (count - 0.5);
+                    (cell - cell.round()).abs() < 0.12
+                };
+                match border {
+                    b if b < 0.2 => 40.0,
+                    _ if line(cell.x, 4.0) || line(cell.y, 6.0) => 60.0 + grid,
+                    _ => 60.0,
+                }
+            });
+            image::Rgb([value.round() as u8; 3])
+        })
+    }
+
+    fn parted(boxes: Vec<ModuleBox>, modules: &[Quad], width: u32, grid: f64) -> Vec<ModuleBox> {
+        let (image, module) = (photo(modules, width, grid), mask(modules, width));
+        part_benches(boxes, &View { image: &image, module: &module, core: None, pixel: Vector2::repeat(1.0) })
+    }
+
+    fn assert_found(found: &[ModuleBox], expected: &[Quad]) {
+        assert_eq!(found.len(), expected.len());
+        for quad in expected {
+            let best = found.iter().map(|b| b.quad().iou(quad)).fold(0.0, f64::max);
+            assert!(best > 0.85, "a module at {:?} has an IoU of {best}", quad.center());
+        }
+    }
+
+    #[test]
+    fn a_bench_without_seams_is_parted_by_what_repeats() {
+        let truth = modules();
+        assert_found(&parted(Vec::new(), &truth, SIZE.0, 110.0), &truth);
+        // Its boxes go that lie across.
+        let b = ModuleBox {
+            center: truth[4].corners[1],
+            u: Vector2::new(0.0, 40.0),
+            v: Vector2::new(25.0, 0.0),
+            score: 0.9,
+            source: Source::Unet,
+        };
+        assert_found(&parted(vec![b], &truth, SIZE.0, 110.0), &truth);
+    }
+
+    #[test]
+    fn a_bench_that_the_frame_cuts_is_parted_from_its_end() {
+        let truth = modules();
+        let width = 300;
+        let found = parted(Vec::new(), &truth, width, 110.0);
+        let is_inside = |quad: &Quad| quad.corners.iter().all(|corner| corner.x <= f64::from(width) - 1.0);
+        let inside: Vec<Quad> = truth.iter().filter(|quad| is_inside(quad)).copied().collect();
+        let found: Vec<ModuleBox> = found.into_iter().filter(|b| is_inside(&b.quad())).collect();
+        assert!(inside.len() > 18 && found.len() <= inside.len() + 1);
+        for quad in &inside {
+            let best = found.iter().map(|b| b.quad().iou(quad)).fold(0.0, f64::max);
+            assert!(best > 0.75, "a module at {:?} has an IoU of {best}", quad.center());
+        }
+    }
+
+    #[test]
+    fn a_missing_module_stays_a_hole() {
+        let mut truth = modules();
+        truth.remove(COLUMNS + 5);
+        assert_found(&parted(Vec::new(), &truth, SIZE.0, 110.0), &truth);
+    }
+
+    #[test]
+    fn without_anything_that_repeats_boxes_stay() {
+        let truth = modules();
+        let roof = Quad {
+            corners: [
+                truth[0].corners[0],
+                truth[COLUMNS - 1].corners[1],
+                truth[ROWS * COLUMNS - 1].corners[2],
+                truth[(ROWS - 1) * COLUMNS].corners[3],
+            ],
+        };
+        assert_eq!(parted(Vec::new(), &[roof], SIZE.0, 0.0), Vec::new());
+        // A bench that boxes cover is left to them.
+        let boxes: Vec<ModuleBox> = truth
+            .iter()
+            .map(|quad| {
+                let [along, across] = quad.sides();
+                ModuleBox { center: quad.center(), u: across * 0.98, v: along * 0.98, score: 0.9, source: Source::Unet }
+            })
+            .collect();
+        assert_eq!(parted(boxes.clone(), &truth, SIZE.0, 110.0), boxes);
+    }
+}
