@@ -159,7 +159,7 @@ fn elect(benches: &[Bench], votes: &[(Vector2<f64>, f64)]) -> Option<Vector2<f64
     let is_same = |a: Vector2<f64>, b: Vector2<f64>| (a - b).amax() < SAME;
     let put_forward = benches.iter().flat_map(|bench| bench.patterns.iter().take(PUT_FORWARD).map(Pattern::sides));
     let mut best: Option<(f64, Vector2<f64>)> = None;
-    for sides in put_forward {
+    for sides in put_forward.chain(votes.iter().map(|(sides, _)| *sides)) {
         let from_benches = benches.iter().filter_map(|bench| {
             let own = bench.patterns.iter().find(|pattern| is_same(pattern.sides(), sides))?;
             Some((own.score - NOTHING).max(0.0) * bench.area_px2.sqrt())
@@ -559,6 +559,22 @@ mod tests {
             source: Source::Unet,
         };
         assert_found(&parted(vec![b], &truth, SIZE.0, 110.0), &truth);
+    }
+
+    #[test]
+    fn benches_that_boxes_cover_tell_the_sides() {
+        let truth = modules();
+        let (wide, high) = (30.0_f64.ln(), 51.0_f64.ln());
+        let (image, module) = (photo(&truth, SIZE.0, 110.0), mask(&truth, SIZE.0));
+        let view = View { image: &image, module: &module, core: None, pixel: Vector2::repeat(1.0) };
+        let components = Components::above(&module, ProbabilityMap::level(FACE));
+        let outline = Outline::of(&module, components.iter().next().unwrap()).unwrap();
+        let bench = Bench::of(outline, 6e4, &view).unwrap();
+        let alone = elect(std::slice::from_ref(&bench), &[]).unwrap();
+        assert!((alone - Vector2::new(wide, high)).amax() < SAME, "{alone:?}");
+        let other = Vector2::new(wide + 0.5, high + 0.5);
+        let told = elect(&[bench], &[(other, 300.0), (other, 300.0)]).unwrap();
+        assert_eq!(told, other);
     }
 
     #[test]
