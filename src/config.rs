@@ -3,6 +3,7 @@
 use crate::detection::{self, DetectionError, Detector, ExecutionProvider, RuntimeSettings};
 use crate::plant::PlantId;
 use crate::store::{KeyId, Scope};
+use axum::http::HeaderValue;
 use clap::{Args, Subcommand, ValueEnum};
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -47,12 +48,38 @@ pub struct ServeArgs {
     #[command(flatten)]
     pub jobs: JobArgs,
     #[command(flatten)]
+    pub network: NetworkArgs,
+    #[command(flatten)]
+    pub metrics: MetricsArgs,
+    #[command(flatten)]
     pub limits: Limits,
+}
+
+/// What stands between the service and its clients.
+#[derive(Debug, Clone, Default, Args)]
+pub struct NetworkArgs {
+    /// Origin of web pages elsewhere whose scripts may use the service, `https://dashboard.example.org`; may be given more
+    /// than once.
+    #[arg(long, env = "HELIOMAP_CORS_ORIGIN", value_delimiter = ',', value_parser = parse_origin, value_name = "ORIGIN")]
+    pub cors_origin: Vec<HeaderValue>,
+    /// A proxy stands in front: clients' addresses are what it appends to `x-forwarded-for`.
+    #[arg(long, env = "HELIOMAP_BEHIND_PROXY")]
+    pub behind_proxy: bool,
+}
+
+/// Where the process tells what it counts.
+#[derive(Debug, Clone, Default, Args)]
+pub struct MetricsArgs {
+    /// Address and port of a listener of its own that answers `GET /metrics` in Prometheus' form, to whoever asks.
+    #[arg(long, env = "HELIOMAP_METRICS_LISTEN", value_name = "ADDRESS")]
+    pub metrics_listen: Option<SocketAddr>,
 }
 
 /// `heliomap worker`.
 #[derive(Debug, Clone, Args)]
 pub struct WorkerArgs {
+    #[command(flatten)]
+    pub metrics: MetricsArgs,
     #[command(flatten)]
     pub storage: StorageArgs,
     #[command(flatten)]
@@ -201,6 +228,18 @@ pub struct Limits {
     /// How long an upload may stand still, and any other request may take, in seconds.
     #[arg(long, env = "HELIOMAP_REQUEST_TIMEOUT", default_value = "30", value_parser = parse_seconds, value_name = "SECONDS")]
     pub request_timeout: Duration,
+    /// Requests per second of one key, on average; for a moment twice as many.
+    #[arg(long, env = "HELIOMAP_MAX_REQUESTS_PER_SECOND", default_value_t = 300, value_parser = clap::value_parser!(u32).range(1..), value_name = "COUNT")]
+    pub max_requests_per_second: u32,
+    /// Requests per minute without a good key from one address before it is told to wait.
+    #[arg(long, env = "HELIOMAP_MAX_FAILED_LOGINS_PER_MINUTE", default_value_t = 300, value_parser = clap::value_parser!(u32).range(1..), value_name = "COUNT")]
+    pub max_failed_logins_per_minute: u32,
+    /// Most connections at once; more wait.
+    #[arg(long, env = "HELIOMAP_MAX_CONNECTIONS", default_value_t = 1024, value_name = "COUNT")]
+    pub max_connections: usize,
+    /// Free space of the data folder's disk that uploads leave to running jobs.
+    #[arg(long, env = "HELIOMAP_DISK_RESERVE", default_value = "1G", value_parser = parse_size, value_name = "SIZE")]
+    pub disk_reserve: u64,
 }
 
 impl Default for Limits {
@@ -215,6 +254,10 @@ impl Default for Limits {
             max_entries: 20_000,
             max_attempts: 3,
             request_timeout: Duration::from_secs(30),
+            max_requests_per_second: 300,
+            max_failed_logins_per_minute: 300,
+            max_connections: 1024,
+            disk_reserve: 1 << 30,
         }
     }
 }
@@ -233,6 +276,15 @@ fn parse_size(text: &str) -> Result<u64, String> {
     number.checked_mul(1 << shift).ok_or_else(|| "the size is too large".to_owned())
 }
 
+/// An origin as browsers write it: scheme, host and port, without a slash at the end.
+fn parse_origin(text: &str) -> Result<HeaderValue, String> {
+    let host = text.strip_prefix("https://").or_else(|| text.strip_prefix("http://")).unwrap_or_default();
+    let value = HeaderValue::from_str(text).ok();
+    value.filter(|_| !host.is_empty() && !host.contains(['/', '*', '?', '#', ' '])).ok_or_else(|| {
+        "an origin is a scheme and a host, such as https://dashboard.example.org, with nothing behind it".to_owned()
+    })
+}
+
 fn parse_seconds(text: &str) -> Result<Duration, String> {
     let seconds = text.parse::<f64>().map_err(|_| "a number of seconds is expected".to_owned())?;
     match Duration::try_from_secs_f64(seconds) {
@@ -244,6 +296,17 @@ fn parse_seconds(text: &str) -> Result<Duration, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn origins() {
+        assert!(parse_origin("https://dashboard.example.org").is_ok() && parse_origin("http://localhost:5173").is_ok());
+        for wrong in
+            ["", "*", "dashboard.example.org", "https://", "https://a/", "https://*.example.org", "https://a\n"]
+        {
+            assert!(parse_origin(wrong).is_err(), "{wrong}");
+        }
+    }
+
     #[test]
     fn sizes() {
         assert_eq!(parse_size("256M"), Ok(256 << 20));

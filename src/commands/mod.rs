@@ -10,12 +10,15 @@ pub mod serve;
 pub mod worker;
 
 use anyhow::Context;
-use heliomap::config::{DetectorArgs, JobArgs, StorageArgs};
+use heliomap::config::{DetectorArgs, JobArgs, Limits, MetricsArgs, StorageArgs};
+use heliomap::http;
 use heliomap::jobs::{PipelineMapper, Worker, WorkerSettings};
 use heliomap::store::{Blobs, PostgresStore, SqliteStore, Store};
+use heliomap::telemetry::metrics::{self, Metrics, Scrape};
 use jiff::Timestamp;
 use std::sync::Arc;
 use std::time::Duration;
+use tokio::net::TcpListener;
 use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 
@@ -53,6 +56,7 @@ fn pipeline_worker(
     blobs: Blobs,
     detector: DetectorArgs,
     jobs: &JobArgs,
+    metrics: Metrics,
     bell: Arc<Notify>,
 ) -> Worker {
     Worker {
@@ -61,8 +65,21 @@ fn pipeline_worker(
         blobs,
         mapper: Arc::new(PipelineMapper::new(Box::new(move || Ok(detector.open(0)?.into())))),
         settings: WorkerSettings::with_lease(jobs.lease),
+        metrics,
         bell,
     }
+}
+
+/// Serves what the process counts, where that is asked for, until it stops.
+async fn serve_metrics(args: &MetricsArgs, scrape: Scrape, stop: &CancellationToken) -> anyhow::Result<()> {
+    let Some(address) = args.metrics_listen else { return Ok(()) };
+    let listener = TcpListener::bind(address).await;
+    let hint = || format!("cannot listen on {address}; choose another address with --metrics-listen");
+    let listener = listener.with_context(hint)?;
+    println!("metrics are on http://{}/metrics", listener.local_addr()?);
+    let stop = stop.clone();
+    tokio::spawn(async move { http::serve(listener, metrics::router(scrape), &Limits::default(), stop).await });
+    Ok(())
 }
 
 /// Runs a service until its end; what then still runs is given a moment and left behind.

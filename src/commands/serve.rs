@@ -1,10 +1,11 @@
 //! `heliomap serve`: the HTTP API and the web page, with a worker inside.
 
-use super::{GRACE, open_storage, pipeline_worker, run_async, stop_signal};
+use super::{GRACE, open_storage, pipeline_worker, run_async, serve_metrics, stop_signal};
 use anyhow::Context;
 use heliomap::config::ServeArgs;
 use heliomap::http::{self, AppState};
 use heliomap::store::Page;
+use heliomap::telemetry::metrics::Scrape;
 use std::sync::Arc;
 use tokio::net::TcpListener;
 use tokio::sync::Notify;
@@ -20,28 +21,26 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
         );
         let (store, blobs) = open_storage(&args.storage).await?;
         let stop = stop_signal()?;
-        let bell = Arc::new(Notify::new());
         let listener = TcpListener::bind(args.listen)
             .await
             .with_context(|| format!("cannot listen on {}; choose another address with --listen", args.listen))?;
         let address = listener.local_addr()?;
 
-        let worker = pipeline_worker(store.clone(), blobs.clone(), args.detector, &args.jobs, bell.clone());
+        let state = AppState {
+            network: Arc::new(args.network),
+            bell: Arc::new(Notify::new()),
+            stop: stop.clone(),
+            insecure: args.insecure,
+            ..AppState::new(store.clone(), blobs.clone(), args.limits.clone())
+        };
+        let (metrics, bell) = (state.metrics.clone(), state.bell.clone());
+        let scrape = Scrape { metrics: metrics.clone(), store: store.clone(), blobs: blobs.clone() };
+        let worker = pipeline_worker(store.clone(), blobs, args.detector, &args.jobs, metrics, bell);
         let worker_stop = stop.clone();
         let working = (!args.no_worker).then(|| tokio::spawn(async move { worker.run(worker_stop).await }));
 
-        let app = http::router(AppState {
-            store: store.clone(),
-            blobs,
-            limits: Arc::new(args.limits),
-            bell,
-            desk: Arc::default(),
-            decoding: http::decoders(),
-            stop: stop.clone(),
-            insecure: args.insecure,
-        });
-        let shutdown = stop.clone().cancelled_owned();
-        let serving = tokio::spawn(axum::serve(listener, app).with_graceful_shutdown(shutdown).into_future());
+        let (app, limits, closing) = (http::router(state), args.limits, stop.clone());
+        let serving = tokio::spawn(async move { http::serve(listener, app, &limits, closing).await });
         if !args.insecure && store.keys(None, Page { after: None, limit: 1 }).await?.is_empty() {
             tracing::warn!(
                 "there is no key yet, so nobody gets in: make the first with `heliomap keys create --scope admin --name NAME` \
@@ -49,10 +48,11 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
             );
         }
         println!("heliomap is listening on http://{address}");
+        serve_metrics(&args.metrics, scrape, &stop).await?;
 
         stop.cancelled().await;
         let ending = async {
-            serving.await??;
+            serving.await?;
             if let Some(working) = working {
                 working.await?;
             }

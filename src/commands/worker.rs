@@ -1,7 +1,8 @@
 //! `heliomap worker`: jobs in a process of their own.
 
-use super::{GRACE, open_storage, pipeline_worker, run_async, stop_signal};
+use super::{GRACE, open_storage, pipeline_worker, run_async, serve_metrics, stop_signal};
 use heliomap::config::WorkerArgs;
+use heliomap::telemetry::metrics::{Metrics, Scrape};
 use std::sync::Arc;
 use tokio::sync::Notify;
 
@@ -10,8 +11,11 @@ pub fn run(args: WorkerArgs) -> anyhow::Result<()> {
     run_async(async {
         let (store, blobs) = open_storage(&args.storage).await?;
         let stop = stop_signal()?;
-        let worker = pipeline_worker(store, blobs, args.detector, &args.jobs, Arc::new(Notify::new()));
+        let metrics = Metrics::default();
+        let scrape = Scrape { metrics: metrics.clone(), store: store.clone(), blobs: blobs.clone() };
+        let worker = pipeline_worker(store, blobs, args.detector, &args.jobs, metrics, Arc::new(Notify::new()));
         println!("heliomap works on jobs in {}", args.storage.data_dir.display());
+        serve_metrics(&args.metrics, scrape, &stop).await?;
         let work = worker.run(stop.clone());
         tokio::pin!(work);
         tokio::select! {

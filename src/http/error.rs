@@ -76,6 +76,7 @@ codes! {
     ArchiveUnsafe = UNPROCESSABLE_ENTITY, "archive_unsafe", "The archive holds entries that no archive should";
     ArchiveUnreadable = UNPROCESSABLE_ENTITY, "archive_unreadable", "The archive cannot be read";
     ArchiveEmpty = UNPROCESSABLE_ENTITY, "archive_empty", "The archive holds no file of a survey";
+    TooManyRequests = TOO_MANY_REQUESTS, "too_many_requests", "Too many requests";
     Internal = INTERNAL_SERVER_ERROR, "internal_error", "The service failed";
     Unavailable = SERVICE_UNAVAILABLE, "unavailable", "The service is not ready";
     StorageFull = INSUFFICIENT_STORAGE, "storage_full", "The service's storage is full";

@@ -4,6 +4,7 @@
 use super::AppState;
 use super::error::{ApiError, Code};
 use super::intake::receive::drain;
+use super::server::Peer;
 use crate::plant::PlantId;
 use crate::store::{ApiKey, AuditEntry, Digest, KeyId, OrganisationId, Scope};
 use axum::extract::{FromRequestParts, MatchedPath, RawPathParams, Request, State};
@@ -13,6 +14,7 @@ use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use jiff::{SignedDuration, Timestamp};
 use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::net::IpAddr;
 use std::sync::Arc;
 use tower_http::request_id::RequestId;
 use utoipa::openapi::security::{HttpAuthScheme, HttpBuilder, SecurityScheme};
@@ -141,6 +143,8 @@ pub fn describe(description: &mut OpenApi) {
                 let responses = &mut operation.responses.responses;
                 responses.insert("401".to_owned(), problem("`unauthorized`: no key, or none that is good").into());
                 responses.insert("403".to_owned(), problem("`forbidden`: the key does not open this").into());
+                responses
+                    .insert("429".to_owned(), problem("`too_many_requests`: wait for `retry-after` seconds").into());
             }
         }
     }
@@ -169,7 +173,8 @@ pub async fn guard(
             return ([(header::ALLOW, allow)], problem).into_response();
         }
     };
-    let caller = match gate.caller(request.headers()).await {
+    let caller = gate.caller(request.headers()).await.map_err(|problem| gate.failed(&request, problem));
+    let caller = match caller.and_then(|caller| gate.within_rate(caller)) {
         Ok(caller) => caller,
         Err(problem) => return refuse(request, problem).await,
     };
@@ -224,6 +229,25 @@ impl Gate {
         Ok(key.into())
     }
 
+    /// What is said to a caller without a good key; who fails too often is told to wait.
+    fn failed(&self, request: &Request, problem: ApiError) -> ApiError {
+        let address = client_address(request, self.state.network.behind_proxy);
+        match address {
+            Some(address) if problem.code == Code::Unauthorized => {
+                self.state.rates.failure(address).err().unwrap_or(problem)
+            }
+            _ => problem,
+        }
+    }
+
+    /// A caller that does not ask too often.
+    fn within_rate(&self, caller: Caller) -> Result<Caller, ApiError> {
+        if let Some((key, _)) = &caller.key {
+            self.state.rates.request(*key)?;
+        }
+        Ok(caller)
+    }
+
     /// Whether a caller may do what asks for one of these scopes. What the caller may not see is not there.
     async fn allow(&self, caller: &Caller, need: &BTreeSet<Scope>, parameters: &RawPathParams) -> Result<(), ApiError> {
         for (name, value) in parameters {
@@ -246,8 +270,17 @@ impl Gate {
     }
 }
 
+/// Where a request comes from. A proxy in front appends the address that it was asked from to `x-forwarded-for`: what
+/// stands before that anyone may have written.
+fn client_address(request: &Request, behind_proxy: bool) -> Option<IpAddr> {
+    let told = request.headers().get_all("x-forwarded-for").iter().next_back();
+    let told = told.and_then(|value| value.to_str().ok()?.rsplit(',').next()?.trim().parse().ok());
+    let peer = request.extensions().get::<Peer>().map(|peer| peer.0.ip());
+    if behind_proxy { told.or(peer) } else { peer }
+}
+
 /// Answers a problem, once what the client is sending was taken off the line within reason.
-async fn refuse(request: Request, problem: ApiError) -> Response {
+pub async fn refuse(request: Request, problem: ApiError) -> Response {
     drain(request.into_body().into_data_stream(), &problem).await;
     let challenge = (problem.code == Code::Unauthorized).then_some([(header::WWW_AUTHENTICATE, "Bearer")]);
     (challenge, problem).into_response()

@@ -4,6 +4,7 @@ pub mod error;
 pub mod router;
 pub mod state;
 
+mod admission;
 mod docs;
 mod events;
 mod extract;
@@ -19,10 +20,14 @@ mod models;
 mod page;
 mod paging;
 mod plants;
+mod rates;
+mod server;
 mod surveys;
 mod tus;
 mod uploads;
 
+pub use rates::Rates;
 pub use router::{openapi, router};
-pub use state::{AppState, decoders};
+pub use server::serve;
+pub use state::AppState;
 pub use tus::Desk;

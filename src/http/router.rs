@@ -2,19 +2,23 @@
 
 use super::guard::{Gate, Policy};
 use super::{
-    AppState, docs, error, events, features, guard, health, idempotency, images, jobs, keys, models, page, plants,
-    surveys, tus, uploads,
+    AppState, admission, docs, error, events, features, guard, health, idempotency, images, jobs, keys, models, page,
+    plants, surveys, tus, uploads,
 };
+use crate::config::NetworkArgs;
+use crate::telemetry::Metrics;
+use crate::telemetry::metrics::RequestLabels;
 use axum::Router;
 use axum::body::Body;
-use axum::extract::{DefaultBodyLimit, Request};
-use axum::http::{HeaderName, HeaderValue, StatusCode};
+use axum::extract::{DefaultBodyLimit, MatchedPath, Request, State};
+use axum::http::{HeaderName, HeaderValue, Method, StatusCode};
 use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tower_http::catch_panic::CatchPanicLayer;
 use tower_http::compression::CompressionLayer;
+use tower_http::cors::CorsLayer;
 use tower_http::request_id::{MakeRequestUuid, PropagateRequestIdLayer, SetRequestIdLayer};
 use tower_http::timeout::TimeoutLayer;
 use tower_http::trace::TraceLayer;
@@ -101,12 +105,15 @@ pub fn openapi() -> utoipa::openapi::OpenApi {
 pub fn router(state: AppState) -> Router {
     let timeout = TimeoutLayer::with_status_code(StatusCode::REQUEST_TIMEOUT, state.limits.request_timeout);
     let prompt = prompt().layer(DefaultBodyLimit::max(MAX_JSON_BYTES)).layer(timeout);
-    let uploads = uploads().layer(DefaultBodyLimit::disable());
+    let admission = middleware::from_fn_with_state(state.clone(), admission::admit);
+    let uploads = uploads().layer(DefaultBodyLimit::disable()).layer(admission);
     let (router, description) = OpenApiRouter::new().merge(prompt).merge(uploads).split_for_parts();
+    let (metrics, cors) = (state.metrics.clone(), cors(&state.network));
     let gate = Gate { state: state.clone(), policy: Arc::new(Policy::of(&description)) };
     router
         .route_layer(middleware::from_fn_with_state(state.clone(), idempotency::once))
         .route_layer(middleware::from_fn_with_state(gate, guard::guard))
+        .route_layer(middleware::from_fn_with_state(metrics, count))
         .fallback(page::serve)
         .method_not_allowed_fallback(|| async { StatusCode::METHOD_NOT_ALLOWED })
         .with_state(state)
@@ -114,10 +121,47 @@ pub fn router(state: AppState) -> Router {
         .layer(CatchPanicLayer::custom(panicked))
         .layer(middleware::map_response(error::only_problems))
         .layer(CompressionLayer::new())
+        .layer(tower::util::option_layer(cors))
         .layer(PropagateRequestIdLayer::new(REQUEST_ID))
         .layer(TraceLayer::new_for_http().make_span_with(span).on_response(log_response).on_failure(()))
         .layer(SetRequestIdLayer::new(REQUEST_ID, MakeRequestUuid))
         .layer(middleware::from_fn(sane_request_id))
+}
+
+/// Lets scripts of web pages elsewhere use the service, where that is configured. They show a key like everyone else.
+fn cors(network: &NetworkArgs) -> Option<CorsLayer> {
+    let headers = ["authorization", "content-type", "content-digest", "if-match", "if-none-match", "repr-digest"];
+    let headers = headers.into_iter().chain(["idempotency-key", "tus-resumable", "upload-checksum", "upload-concat"]);
+    let headers = headers.chain(["upload-length", "upload-metadata", "upload-offset", "x-http-method-override"]);
+    let exposed = ["etag", "link", "location", "retry-after", "tus-extension", "tus-max-size", "tus-resumable"];
+    let exposed = exposed.into_iter().chain(["tus-version", "upload-expires", "upload-offset", "x-request-id"]);
+    let methods = [Method::GET, Method::HEAD, Method::POST, Method::PUT, Method::PATCH, Method::DELETE];
+    (!network.cors_origin.is_empty()).then(|| {
+        CorsLayer::new()
+            .allow_origin(network.cors_origin.clone())
+            .allow_methods(methods)
+            .allow_headers(headers.chain(["x-request-id"]).map(HeaderName::from_static).collect::<Vec<_>>())
+            .expose_headers(exposed.map(HeaderName::from_static).collect::<Vec<_>>())
+            .max_age(Duration::from_secs(3600))
+    })
+}
+
+/// Counts requests by their routes.
+async fn count(State(metrics): State<Metrics>, route: MatchedPath, request: Request, next: Next) -> Response {
+    struct InFlight(Metrics);
+    impl Drop for InFlight {
+        fn drop(&mut self) {
+            self.0.requests_in_flight.dec();
+        }
+    }
+    metrics.requests_in_flight.inc();
+    // Also where the client goes before it is answered.
+    let in_flight = InFlight(metrics);
+    let (begun, method) = (Instant::now(), request.method().to_string());
+    let response = next.run(request).await;
+    let labels = RequestLabels { method, route: route.as_str().to_owned(), status: response.status().as_u16() };
+    in_flight.0.answered(&labels, begun.elapsed());
+    response
 }
 
 /// A client may name its requests, but only with what is safe in a log.

@@ -1,10 +1,12 @@
 //! What every handler may use.
 
 use super::error::{ApiError, Code};
+use super::rates::Rates;
 use super::tus::Desk;
-use crate::config::Limits;
+use crate::config::{Limits, NetworkArgs};
 use crate::plant::PlantId;
 use crate::store::{Blobs, Plant, Store, Survey, SurveyId};
+use crate::telemetry::Metrics;
 use std::sync::Arc;
 use tokio::sync::{Notify, Semaphore};
 use tokio_util::sync::CancellationToken;
@@ -15,6 +17,9 @@ pub struct AppState {
     pub store: Arc<dyn Store>,
     pub blobs: Blobs,
     pub limits: Arc<Limits>,
+    pub network: Arc<NetworkArgs>,
+    pub metrics: Metrics,
+    pub rates: Arc<Rates>,
     pub desk: Arc<Desk>,
     /// One permit for each photo that may be decoded at once.
     pub decoding: Arc<Semaphore>,
@@ -27,12 +32,29 @@ pub struct AppState {
 }
 
 /// How many photos may be decoded at once: half of the cores answer requests.
-pub fn decoders() -> Arc<Semaphore> {
+fn decoders() -> Arc<Semaphore> {
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     Arc::new(Semaphore::new((cores / 2).max(1)))
 }
 
 impl AppState {
+    /// Of a service that asks for keys, alone in the world.
+    pub fn new(store: Arc<dyn Store>, blobs: Blobs, limits: Limits) -> Self {
+        Self {
+            store,
+            blobs,
+            rates: Arc::new(Rates::new(&limits)),
+            limits: Arc::new(limits),
+            network: Arc::default(),
+            metrics: Metrics::default(),
+            desk: Arc::default(),
+            decoding: decoders(),
+            bell: Arc::default(),
+            stop: CancellationToken::new(),
+            insecure: false,
+        }
+    }
+
     /// The plant, or a problem.
     pub async fn require_plant(&self, plant: PlantId) -> Result<Plant, ApiError> {
         self.store.plant(plant).await?.ok_or_else(|| Self::no_plant(plant))

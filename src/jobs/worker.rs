@@ -5,6 +5,8 @@ use super::{AttemptError, Mapper, folder, rows};
 use crate::pipeline::{MapError, MapOptions, Subject};
 use crate::plant::PlantModel;
 use crate::store::{Blobs, Claim, Completed, Digest, Ending, FileRecord, Heartbeat, NewModel, Store, StoreError};
+use crate::telemetry::Metrics;
+use crate::telemetry::metrics::OutcomeLabels;
 use jiff::Timestamp;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -53,6 +55,7 @@ pub struct Worker {
     pub blobs: Blobs,
     pub mapper: Arc<dyn Mapper>,
     pub settings: WorkerSettings,
+    pub metrics: Metrics,
     /// Rung when a job was queued in this process.
     pub bell: Arc<Notify>,
 }
@@ -203,7 +206,11 @@ impl Worker {
         let (bytes, layers, warnings) = mapping.await.map_err(|_| AttemptError::Panicked)??;
         let size = bytes.len() as u64;
         let sha256 = self.blobs.put_bytes(job.plant, bytes).await?;
-        let stage_ms = watch.pace().map(|pace| serde_json::json!(pace).to_string());
+        let pace = watch.pace();
+        if let Some(pace) = &pace {
+            self.metrics.mapped(&pace.stage_ms);
+        }
+        let stage_ms = pace.map(|pace| serde_json::json!(pace).to_string());
         Ok(NewModel { version, sha256, size, warnings, stage_ms, layers })
     }
 
@@ -227,6 +234,7 @@ impl Worker {
                 let _ = self.store.heartbeat(claim, watch.progress(), self.settings.lease, now).await?;
                 match self.store.complete_job(claim, &model, now).await? {
                     Completed::Done(model) => {
+                        self.count("succeeded");
                         tracing::info!(version = model.version, "model stored");
                         return Ok(());
                     }
@@ -246,10 +254,20 @@ impl Worker {
             (Err(error), _) => self.ending(claim, error, now),
         };
         tracing::info!(?ending, "job ends without a model");
+        self.count(match &ending {
+            Ending::Failed { .. } => "failed",
+            Ending::Retry { .. } => "tried_again",
+            Ending::Cancelled => "cancelled",
+            Ending::Released => "released",
+        });
         if !self.store.end_job(claim, &ending, now).await? {
             tracing::warn!("the job is in other hands or gone");
         }
         Ok(())
+    }
+
+    fn count(&self, outcome: &'static str) {
+        self.metrics.attempts.get_or_create(&OutcomeLabels { outcome }).inc();
     }
 
     /// What is said of an error, and whether the job is tried again.

@@ -214,6 +214,13 @@ impl Blobs {
         Ok(())
     }
 
+    /// Free bytes for those who are not root on the disk that takes what comes in.
+    pub fn free_bytes(&self) -> Result<u64, StoreError> {
+        let found = rustix::fs::statvfs(&self.staging);
+        let found = found.map_err(|error| io("look for free space in", &self.staging)(error.into()))?;
+        Ok(found.f_bavail.saturating_mul(found.f_frsize))
+    }
+
     /// Fails where the blob store does not answer.
     pub async fn ping(&self) -> Result<(), StoreError> {
         match &self.local {

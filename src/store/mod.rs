@@ -21,7 +21,7 @@ pub use postgres::PostgresStore;
 pub use records::{
     Cancelled, Checkpoint, Claim, Completed, Created, Ending, Enqueued, Feature, FeatureQuery, FileRecord, FileWritten,
     GeoBox, Heartbeat, Job, JobId, JobRequest, JobState, LayerInfo, Model, NewFeature, NewLayer, NewModel, Page, Plant,
-    Progress, Survey, SurveyId,
+    Pool, Progress, Queue, Survey, SurveyId,
 };
 pub use requests::RequestStore;
 pub use secret::Secret;
@@ -60,7 +60,8 @@ pub enum StoreError {
 impl StoreError {
     /// Whether the disk is full.
     pub fn is_full(&self) -> bool {
-        let full = |error: &std::io::Error| error.kind() == std::io::ErrorKind::StorageFull;
+        use std::io::ErrorKind::{QuotaExceeded, StorageFull};
+        let full = |error: &std::io::Error| matches!(error.kind(), StorageFull | QuotaExceeded);
         match self {
             Self::Io { source, .. } => full(source),
             // SQLITE_FULL, and Postgres' disk_full.
@@ -137,6 +138,11 @@ pub trait Store: AccessStore + UploadStore + RequestStore {
     async fn jobs(&self, plant: PlantId, survey: Option<SurveyId>, page: Page) -> Result<Vec<Job>, StoreError>;
     /// Cancels a queued job at once, asks a running one to stop, leaves a finished one.
     async fn cancel_job(&self, plant: PlantId, id: JobId, now: Timestamp) -> Result<Option<Cancelled>, StoreError>;
+
+    /// How the queue stands.
+    async fn queue(&self, now: Timestamp) -> Result<Queue, StoreError>;
+    /// The connections of this process.
+    fn pools(&self) -> Vec<Pool>;
 
     /// Takes the job of the highest priority that may run, of these the oldest: queued and due, or abandoned by its
     /// worker; of a plant none of whose jobs runs. Ends jobs that were abandoned too often. The attempt is counted here,

@@ -35,6 +35,11 @@ impl PostgresStore {
         Ok(Self { read: pool.clone(), write: pool })
     }
 
+    /// Name, open and idle connections of each pool.
+    fn sizes(&self) -> Vec<(&'static str, u32, usize)> {
+        vec![("all", self.read.size(), self.read.num_idle())]
+    }
+
     async fn begin(&self) -> Result<Tx, StoreError> {
         Ok(self.write.begin().await?)
     }

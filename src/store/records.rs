@@ -8,6 +8,7 @@ use crate::reconstruction::PhotoFacts;
 use jiff::Timestamp;
 use std::fmt;
 use std::str::FromStr;
+use std::time::Duration;
 use uuid::Uuid;
 
 macro_rules! row_id {
@@ -177,6 +178,26 @@ pub struct Job {
     pub created: Timestamp,
     pub started: Option<Timestamp>,
     pub finished: Option<Timestamp>,
+}
+
+/// How the queue stands, whoever's jobs they are.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Queue {
+    /// How many jobs are in each state, all states.
+    pub jobs: Vec<(JobState, u64)>,
+    /// How many wait for a worker and may be taken now.
+    pub waiting: u64,
+    /// How long the oldest of these has been waiting.
+    pub oldest: Option<Duration>,
+}
+
+/// Connections to the database.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Pool {
+    pub name: &'static str,
+    pub open: u64,
+    /// Of those that are open.
+    pub idle: u64,
 }
 
 /// A mapping asked for.

@@ -174,6 +174,10 @@ pub const CANCEL_JOB: &str = concat!(
     job!()
 );
 
+pub const JOBS_BY_STATE: &str = "SELECT state, COUNT(*) AS jobs FROM jobs GROUP BY state";
+pub const QUEUE: &str = "\
+    SELECT COUNT(*) AS waiting, MIN(run_after_ms) AS since_ms FROM jobs WHERE state = 'queued' AND run_after_ms <= $1";
+
 /// Ends jobs whose worker fell silent and that were cancelled or had their last attempt.
 pub const BURY_ABANDONED_JOBS: &str = "\
     UPDATE jobs SET finished_ms = $1, lease_until_ms = NULL, \

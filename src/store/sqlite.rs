@@ -42,6 +42,12 @@ impl SqliteStore {
         Ok(Self { read, write })
     }
 
+    /// Name, open and idle connections of each pool.
+    fn sizes(&self) -> Vec<(&'static str, u32, usize)> {
+        let size = |name, pool: &SqlitePool| (name, pool.size(), pool.num_idle());
+        vec![size("read", &self.read), size("write", &self.write)]
+    }
+
     /// A transaction that holds the write lock from its start, so that it cannot fail half-way for want of it.
     async fn begin(&self) -> Result<Tx, StoreError> {
         Ok(self.write.begin_with("BEGIN IMMEDIATE").await?)

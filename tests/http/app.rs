@@ -1,19 +1,22 @@
 //! A service of its own for each test.
 
-use heliomap::config::Limits;
+use axum::http::HeaderValue;
+use heliomap::config::{Limits, NetworkArgs};
 use heliomap::detection::{Detector, ImageDetections};
 use heliomap::geometry::{GeodeticReference, Lla};
-use heliomap::http::{AppState, decoders, router};
+use heliomap::http::{AppState, router, serve};
 use heliomap::jobs::{Mapper, PipelineMapper, Worker, WorkerSettings};
 use heliomap::pipeline::{Found, MapError, MapOptions, Observer, Stage, Subject};
 use heliomap::plant::{
     Bench, BenchId, Line, LineId, Module, ModuleId, ModuleStatus, PlantId, PlantModel, Sector, SectorId, Warning,
 };
 use heliomap::store::{Blobs, Created, NewKey, Scope, Secret, SqliteStore, Store};
+use heliomap::telemetry::Metrics;
 use nalgebra::Vector3;
 use reqwest::{Client, Method, RequestBuilder, Response, StatusCode};
 use serde_json::{Value, json};
 use std::collections::VecDeque;
+use std::ops::Deref;
 use std::path::Path;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -180,7 +183,24 @@ pub struct App {
     pub store: Arc<dyn Store>,
     /// The secret that requests show.
     pub secret: Option<String>,
+    metrics: Metrics,
+    blobs: Blobs,
+    cancelled: CancellationToken,
     _stop: DropGuard,
+}
+
+/// A service over what another one has stored, which lives at least as long.
+pub struct Beside<'a> {
+    app: App,
+    _of: &'a App,
+}
+
+impl Deref for Beside<'_> {
+    type Target = App;
+
+    fn deref(&self) -> &App {
+        &self.app
+    }
 }
 
 impl App {
@@ -207,6 +227,64 @@ impl App {
         let acts = Mutex::new(VecDeque::from([Act::Map(2)]));
         let mapper = Arc::new(ScriptedMapper { acts, seen: Mutex::default(), closing: stop.clone() });
         Self::start(Some(mapper.clone()), mapper, Limits::default(), stop, false).await
+    }
+
+    /// That asks for keys, with limits of its own.
+    pub async fn with_keys_and_limits(limits: Limits) -> Self {
+        let stop = CancellationToken::new();
+        let mapper = Arc::new(ScriptedMapper { acts: Mutex::default(), seen: Mutex::default(), closing: stop.clone() });
+        Self::start(None, mapper, limits, stop, false).await
+    }
+
+    /// That lets scripts of an origin's pages in.
+    pub async fn for_pages_of(origin: &'static str) -> Self {
+        let mut app = Self::new(&[]).await;
+        let network = NetworkArgs { cors_origin: vec![HeaderValue::from_static(origin)], behind_proxy: false };
+        app.base = app.again(Limits::default(), Arc::new(network), app.cancelled.clone()).await;
+        app
+    }
+
+    /// Another service, without a worker, over what this one has stored.
+    pub async fn beside(&self, limits: Limits) -> Beside<'_> {
+        let stop = CancellationToken::new();
+        let base = self.again(limits, Arc::default(), stop.clone()).await;
+        let mapper = self.mapper.clone();
+        let (client, metrics, blobs) = (Client::new(), Metrics::default(), self.blobs.clone());
+        let (folder, store, secret) = (tempfile::tempdir().unwrap(), self.store.clone(), self.secret.clone());
+        let cancelled = stop.clone();
+        let app =
+            Self { base, client, mapper, metrics, blobs, folder, store, secret, cancelled, _stop: stop.drop_guard() };
+        Beside { app, _of: self }
+    }
+
+    async fn again(&self, limits: Limits, network: Arc<NetworkArgs>, stop: CancellationToken) -> String {
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let base = format!("http://{}", listener.local_addr().unwrap());
+        let state = AppState::new(self.store.clone(), self.blobs.clone(), limits.clone());
+        let state = AppState { network, insecure: true, stop: stop.clone(), ..state };
+        tokio::spawn(async move { serve(listener, router(state), &limits, stop).await });
+        base
+    }
+
+    /// Tells the service to stop.
+    pub fn stop(&self) {
+        self.cancelled.cancel();
+    }
+
+    /// What the service counts.
+    pub async fn metrics(&self) -> String {
+        self.metrics.render(&*self.store, &self.blobs).await.unwrap()
+    }
+
+    /// Waits until what the service counts is as wanted.
+    pub async fn metrics_until(&self, wanted: impl Fn(&str) -> bool) {
+        for _ in 0..24_000 {
+            if wanted(&self.metrics().await) {
+                return;
+            }
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+        panic!("the service does not get there: {}", self.metrics().await);
     }
 
     /// The secret of a new key.
@@ -238,10 +316,12 @@ impl App {
         stop: CancellationToken,
         insecure: bool,
     ) -> Self {
+        // The mapper hears of the test's end alone, the service may stop before.
+        let cancelled = stop.child_token();
         let folder = tempfile::tempdir().unwrap();
         let store: Arc<dyn Store> = Arc::new(SqliteStore::open(&folder.path().join("heliomap.db")).await.unwrap());
         let blobs = Blobs::in_folder(folder.path()).unwrap();
-        let bell = Arc::new(Notify::new());
+        let (bell, metrics) = (Arc::new(Notify::new()), Metrics::default());
         if let Some(mapper) = working {
             let worker = Worker {
                 name: "test".to_owned(),
@@ -254,25 +334,26 @@ impl App {
                     poll: Duration::from_millis(20),
                     backoff: Duration::from_millis(10),
                 },
+                metrics: metrics.clone(),
                 bell: bell.clone(),
             };
-            let stop = stop.clone();
+            let stop = cancelled.clone();
             tokio::spawn(async move { worker.run(stop).await });
         }
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
         let base = format!("http://{}", listener.local_addr().unwrap());
-        let app = router(AppState {
-            store: store.clone(),
-            blobs,
-            limits: Arc::new(limits),
+        let served = limits.clone();
+        let state = AppState {
             bell,
-            desk: Arc::default(),
-            decoding: decoders(),
-            stop: stop.clone(),
+            metrics: metrics.clone(),
             insecure,
-        });
-        tokio::spawn(axum::serve(listener, app).with_graceful_shutdown(stop.clone().cancelled_owned()).into_future());
-        Self { base, client: Client::new(), mapper, folder, store, secret: None, _stop: stop.drop_guard() }
+            stop: cancelled.clone(),
+            ..AppState::new(store.clone(), blobs.clone(), limits)
+        };
+        let (app, closing) = (router(state), cancelled.clone());
+        tokio::spawn(async move { serve(listener, app, &served, closing).await });
+        let (client, secret) = (Client::new(), None);
+        Self { base, client, mapper, folder, store, secret, metrics, blobs, cancelled, _stop: stop.drop_guard() }
     }
 
     pub fn request(&self, method: Method, path: &str) -> RequestBuilder {

@@ -9,6 +9,7 @@ mod contract;
 mod idempotency;
 mod images;
 mod jobs;
+mod limits;
 mod models;
 mod plants;
 mod reconstruction;

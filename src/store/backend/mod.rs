@@ -9,8 +9,8 @@ mod uploads;
 use super::super::sql;
 use super::super::{
     Cancelled, Checkpoint, Claim, Completed, Created, Digest, Ending, Enqueued, Feature, FeatureQuery, FileRecord,
-    FileWritten, GeoBox, Heartbeat, Job, JobId, JobRequest, LayerInfo, Model, NewFeature, NewModel, OrganisationId,
-    Page, Plant, Progress, Store, StoreError, Survey, SurveyId, SurveyPath,
+    FileWritten, GeoBox, Heartbeat, Job, JobId, JobRequest, JobState, LayerInfo, Model, NewFeature, NewModel,
+    OrganisationId, Page, Plant, Pool, Progress, Queue, Store, StoreError, Survey, SurveyId, SurveyPath,
 };
 use super::{Row, Rows, Tx};
 use crate::plant::{Layer, ModuleId, PlantId};
@@ -268,6 +268,26 @@ impl Store for Rows {
         };
         tx.commit().await?;
         Ok(outcome)
+    }
+
+    async fn queue(&self, now: Timestamp) -> Result<Queue, StoreError> {
+        let rows = sqlx::query(sql::JOBS_BY_STATE).fetch_all(&self.read).await?;
+        let mut jobs: Vec<_> = JobState::ALL.into_iter().map(|state| (state, 0)).collect();
+        for row in rows {
+            let (state, count): (String, i64) = (row.try_get("state")?, row.try_get("jobs")?);
+            if let Some(known) = jobs.iter_mut().find(|(known, _)| known.as_str() == state) {
+                known.1 = count as u64;
+            }
+        }
+        let row = sqlx::query(sql::QUEUE).bind(now.as_millisecond()).fetch_one(&self.read).await?;
+        let since_ms: Option<i64> = row.try_get("since_ms")?;
+        let age = |since_ms: i64| Duration::from_millis(now.as_millisecond().saturating_sub(since_ms).max(0) as u64);
+        Ok(Queue { jobs, waiting: row.try_get::<i64, _>("waiting")? as u64, oldest: since_ms.map(age) })
+    }
+
+    fn pools(&self) -> Vec<Pool> {
+        let pool = |(name, open, idle): (&'static str, u32, usize)| Pool { name, open: open.into(), idle: idle as u64 };
+        self.sizes().into_iter().map(pool).collect()
     }
 
     async fn claim_job(&self, worker: &str, lease: Duration, now: Timestamp) -> Result<Option<Claim>, StoreError> {

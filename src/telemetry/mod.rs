@@ -1,4 +1,8 @@
-//! Structured events to standard error.
+//! What the service tells of itself: structured events to standard error, and metrics.
+
+pub mod metrics;
+
+pub use metrics::Metrics;
 
 use crate::config::{LogArgs, LogFormat};
 use tracing_subscriber::EnvFilter;

@@ -1,0 +1,185 @@
+//! Whoever asks too much, too slowly or without room for it is told so, and the others do not notice.
+
+use crate::app::{Act, App, assert_problem, job_path, jpeg, json_of};
+use heliomap::config::Limits;
+use heliomap::store::Scope;
+use reqwest::{Method, StatusCode};
+use serde_json::json;
+use std::time::Duration;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
+
+#[tokio::test]
+async fn a_key_that_asks_too_often_is_told_to_wait() {
+    let limits = Limits { max_requests_per_second: 1, ..Limits::default() };
+    let mut app = App::with_keys_and_limits(limits).await;
+    let (busy, other) = (app.key("owner", &[Scope::Read], None).await, app.key("owner", &[Scope::Read], None).await);
+    app.secret = Some(busy);
+    let mut answers = Vec::new();
+    for _ in 0..20 {
+        answers.push(app.request(Method::GET, "/api/v1/plants").send().await.unwrap());
+    }
+    let refused: Vec<_> = answers.into_iter().filter(|answer| answer.status() != StatusCode::OK).collect();
+    // Twenty requests take well below the 18 s in which they would all be let through.
+    assert!(!refused.is_empty());
+    for answer in refused {
+        let wait: u64 = answer.headers()["retry-after"].to_str().unwrap().parse().unwrap();
+        assert!((1..=2).contains(&wait), "{wait}");
+        assert_problem(json_of(answer).await, 429, "too_many_requests", "too often");
+    }
+    app.secret = Some(other);
+    assert_eq!(app.get("/api/v1/plants").await.0, StatusCode::OK);
+}
+
+#[tokio::test]
+async fn an_address_that_fails_too_often_is_told_to_wait_and_good_keys_go_on() {
+    let limits = Limits { max_failed_logins_per_minute: 3, ..Limits::default() };
+    let mut app = App::with_keys_and_limits(limits).await;
+    let good = app.key("owner", &[Scope::Read], None).await;
+    app.secret = Some("hm_guessed".to_owned());
+    let mut statuses = Vec::new();
+    for _ in 0..5 {
+        let answer = app.request(Method::GET, "/api/v1/plants").send().await.unwrap();
+        let told = answer.headers().contains_key("retry-after");
+        assert_eq!(told, answer.status() == StatusCode::TOO_MANY_REQUESTS);
+        statuses.push(answer.status().as_u16());
+    }
+    assert_eq!(statuses, [401, 401, 401, 429, 429]);
+    app.secret = Some(good);
+    assert_eq!(app.get("/api/v1/plants").await.0, StatusCode::OK);
+}
+
+#[tokio::test]
+async fn a_full_disk_refuses_uploads_and_breaks_no_job() {
+    let (limits, lavish) = (Limits { disk_reserve: u64::MAX, ..Limits::default() }, Limits::default());
+    let app = App::with_limits(&[Act::Map(2)], lavish).await;
+    let survey = app.complete_survey().await;
+    // The same store, seen by a service for which the disk is full.
+    let full = app.beside(limits).await;
+    let answer = full.request(Method::PUT, &format!("{survey}/images/c.jpg")).body(jpeg(8, 8)).send().await.unwrap();
+    assert_eq!(answer.headers()["retry-after"], "60");
+    assert_problem(json_of(answer).await, 507, "storage_full", "nothing of it was stored");
+    let begun = full.request(Method::POST, &format!("{survey}/uploads")).header("tus-resumable", "1.0.0");
+    let begun = begun.header("upload-length", 9).header("upload-metadata", "filename Yi5qcGc=").send().await.unwrap();
+    assert_eq!(begun.status(), StatusCode::INSUFFICIENT_STORAGE);
+    let (status, job) = full.post(&format!("{survey}/jobs"), json!({})).await;
+    assert_eq!(status, StatusCode::ACCEPTED, "{job}");
+    assert_eq!(app.follow(&job).await["state"], "succeeded");
+    assert_eq!(full.get(&survey).await.1["files"].as_array().unwrap().len(), 4);
+}
+
+#[tokio::test]
+async fn who_sends_no_request_is_let_go() {
+    let limits = Limits { request_timeout: Duration::from_millis(200), ..Limits::default() };
+    let app = App::with_limits(&[], limits).await;
+    let address = app.base.strip_prefix("http://").unwrap().to_owned();
+    for sent in ["", "GET /health HTTP/1.1\r\nhost: x\r\n"] {
+        let mut stream = TcpStream::connect(&address).await.unwrap();
+        stream.write_all(sent.as_bytes()).await.unwrap();
+        let mut answer = Vec::new();
+        let ended = tokio::time::timeout(Duration::from_secs(60), stream.read_to_end(&mut answer)).await;
+        assert!(ended.is_ok(), "the service waits for ever after {sent:?}");
+    }
+}
+
+#[tokio::test]
+async fn connections_beyond_the_limit_wait_and_are_served_then() {
+    let app = App::with_limits(&[], Limits { max_connections: 1, ..Limits::default() }).await;
+    let address = app.base.strip_prefix("http://").unwrap().to_owned();
+    let first = TcpStream::connect(&address).await.unwrap();
+    let mut second = TcpStream::connect(&address).await.unwrap();
+    second.write_all(b"GET /health HTTP/1.1\r\nhost: x\r\nconnection: close\r\n\r\n").await.unwrap();
+    let mut byte = [0];
+    let early = tokio::time::timeout(Duration::from_millis(200), second.read_exact(&mut byte)).await;
+    assert!(early.is_err(), "the second connection is served beside the first");
+    drop(first);
+    let mut answer = String::new();
+    second.read_to_string(&mut answer).await.unwrap();
+    assert!(answer.contains("\"ok\""), "{answer}");
+}
+
+#[tokio::test]
+async fn scripts_of_other_pages_get_in_where_that_is_configured() {
+    let origin = "https://dashboard.example.org";
+    let app = App::for_pages_of(origin).await;
+    let preflight = |from: &str| {
+        let request = app.request(Method::OPTIONS, "/api/v1/plants").header("origin", from);
+        let request = request.header("access-control-request-method", "GET");
+        request.header("access-control-request-headers", "authorization").send()
+    };
+    let answer = preflight(origin).await.unwrap();
+    assert!(answer.status().is_success(), "{}", answer.status());
+    assert_eq!(answer.headers()["access-control-allow-origin"], origin);
+    assert!(answer.headers()["access-control-allow-headers"].to_str().unwrap().contains("authorization"));
+    assert!(
+        !preflight("https://evil.example.org").await.unwrap().headers().contains_key("access-control-allow-origin")
+    );
+    let answer = app.request(Method::GET, "/api/v1/plants").header("origin", origin).send().await.unwrap();
+    assert_eq!(answer.headers()["access-control-allow-origin"], origin);
+    assert!(answer.headers()["access-control-expose-headers"].to_str().unwrap().contains("upload-offset"));
+
+    let closed = App::new(&[]).await;
+    let answer = closed.request(Method::GET, "/api/v1/plants").header("origin", origin).send().await.unwrap();
+    assert!(!answer.headers().contains_key("access-control-allow-origin"));
+}
+
+#[tokio::test]
+async fn a_service_that_stops_ends_its_requests_and_puts_its_job_back() {
+    let app = App::new(&[Act::Wait]).await;
+    let survey = app.complete_survey().await;
+    let (_, job) = app.post(&format!("{survey}/jobs"), json!({})).await;
+    app.follow_until(&job, |job| job["state"] == "running").await;
+    // A photo of which half has come when the service is told to stop.
+    let photo = jpeg(64, 48);
+    let (first, second) = photo.split_at(photo.len() / 2);
+    let (send, body) = tokio::sync::mpsc::channel::<Result<Vec<u8>, std::io::Error>>(1);
+    send.send(Ok(first.to_vec())).await.unwrap();
+    let body = reqwest::Body::wrap_stream(tokio_stream::wrappers::ReceiverStream::new(body));
+    let request = app.request(Method::PUT, &format!("{survey}/images/late.jpg")).body(body);
+    let upload = tokio::spawn(request.send());
+    app.metrics_until(|text| text.contains("heliomap_upload_bytes_total") && in_flight(text) == 1).await;
+    app.stop();
+    send.send(Ok(second.to_vec())).await.unwrap();
+    drop(send);
+    assert_eq!(upload.await.unwrap().unwrap().status(), StatusCode::CREATED);
+    let again = app.beside(Limits::default()).await;
+    let waiting = again.follow_until(&job, |job| job["state"] == "queued").await;
+    assert_eq!(waiting["attempt"], 0, "{}: {waiting}", job_path(&job));
+}
+
+fn in_flight(metrics: &str) -> u64 {
+    let line = metrics.lines().find_map(|line| line.strip_prefix("heliomap_requests_in_flight "));
+    line.unwrap().parse().unwrap()
+}
+
+#[tokio::test]
+async fn metrics_tell_what_happened() {
+    let app = App::new(&[Act::Map(2), Act::RefuseInput]).await;
+    let survey = app.complete_survey().await;
+    app.map(&survey).await;
+    app.map(&survey).await;
+    app.get("/api/v1/plants/x").await;
+    let metrics = app.metrics().await;
+    let uploads = "heliomap_requests_total{method=\"PUT\",\
+        route=\"/api/v1/plants/{plant}/surveys/{survey}/images/{name}\",status=\"201\"} 2";
+    for line in [
+        uploads,
+        "heliomap_requests_total{method=\"GET\",route=\"/api/v1/plants/{plant}\",status=\"404\"} 1",
+        "heliomap_requests_in_flight 0",
+        "heliomap_job_attempts_total{outcome=\"succeeded\"} 1",
+        "heliomap_job_attempts_total{outcome=\"failed\"} 1",
+        "heliomap_jobs{state=\"succeeded\"} 1",
+        "heliomap_jobs{state=\"queued\"} 0",
+        "heliomap_queue_depth 0",
+        "heliomap_queue_age_seconds 0.0",
+        "heliomap_database_connections{pool=\"write\",state=\"used\"} 0",
+    ] {
+        assert!(metrics.lines().any(|told| told == line), "{line}\n{metrics}");
+    }
+    for begin in ["heliomap_request_seconds_bucket{le=\"0.1\",method=\"PUT\"", "heliomap_disk_free_bytes "] {
+        assert!(metrics.lines().any(|told| told.starts_with(begin)), "{begin}\n{metrics}");
+    }
+    let bytes = metrics.lines().find_map(|line| line.strip_prefix("heliomap_upload_bytes_total ")).unwrap();
+    assert!(bytes.parse::<u64>().unwrap() > 2 * jpeg(32, 24).len() as u64, "{bytes}");
+    assert!(metrics.ends_with("# EOF\n"));
+}
