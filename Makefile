@@ -58,9 +58,11 @@ client: setup ## The Python client and every command of docs/API.md against the 
 	$(PYTHON) -m unittest discover --start-directory tests/clients
 
 KILLS ?= 200
-kills: setup ## Kill server and worker at random (KILLS times): nothing is lost, models are those of a run without kills
+kills: setup ## Kill server and worker at random (KILLS times, half of them on Postgres): nothing is lost, models are the same
 	$(CARGO) test --locked --no-run
-	$(PYTHON) tests/kills/kills.py --binary target/debug/heliomap --kills $(KILLS)
+	$(PYTHON) tests/kills/kills.py --binary target/debug/heliomap --kills $$(( $(KILLS) / 2 ))
+	tests/with-postgres.sh bash -c '$(PYTHON) tests/kills/kills.py --binary target/debug/heliomap \
+	  --kills $$(( $(KILLS) - $(KILLS) / 2 )) --seed 2 --database "$$HELIOMAP_TEST_POSTGRES/postgres"'
 
 tus: setup .venv/tus/done tests/tus/node_modules/done ## Upload 1 GB by two tus clients through 20 disconnects and a kill: the bytes agree
 	$(CARGO) build --locked

@@ -4,6 +4,7 @@
 use super::AppState;
 use super::error::{ApiError, Code};
 use super::guard::refuse;
+use crate::config::Limits;
 use axum::body::Body;
 use axum::extract::{Request, State};
 use axum::http::{HeaderMap, Method, header};
@@ -19,17 +20,20 @@ pub async fn admit(State(state): State<AppState>, request: Request, next: Next) 
     if !matches!(*request.method(), Method::PUT | Method::POST | Method::PATCH) {
         return next.run(request).await;
     }
-    if let Err(problem) = room_on_disk(&state, announced(request.headers())) {
+    if let Err(problem) = room_on_disk(&state, announced(request.headers(), &state.limits)) {
         return refuse(request, problem).await;
     }
     let (parts, body) = request.into_parts();
     next.run(Request::from_parts(parts, watched(state, body))).await
 }
 
-/// How many bytes a request says that it brings: the whole file's where it begins a resumable upload.
-fn announced(headers: &HeaderMap) -> u64 {
+/// How many bytes a request says that it brings: the whole file's where it begins a resumable upload. What is more than
+/// anything may have is refused for that, whatever room there is.
+fn announced(headers: &HeaderMap, limits: &Limits) -> u64 {
     let number = |name: &str| headers.get(name).and_then(|value| value.to_str().ok()?.parse::<u64>().ok());
-    number("upload-length").or_else(|| number(header::CONTENT_LENGTH.as_str())).unwrap_or(0)
+    let announced = number("upload-length").or_else(|| number(header::CONTENT_LENGTH.as_str()));
+    let largest = limits.max_archive_size.max(limits.max_file_size).max(limits.max_image_size);
+    announced.filter(|bytes| *bytes <= largest).unwrap_or(0)
 }
 
 fn room_on_disk(state: &AppState, bytes: u64) -> Result<(), ApiError> {

@@ -182,3 +182,64 @@ fn the_description_is_printed() {
     let output = Command::new(env!("CARGO_BIN_EXE_heliomap")).arg("openapi").output().unwrap();
     assert_eq!(String::from_utf8(output.stdout).unwrap(), include_str!("../../openapi.yaml"));
 }
+
+/// Everything that a program logs at its most talkative, in JSON, while a request with a secret comes and is refused, another
+/// is answered, and a job runs.
+#[test]
+fn logs_name_requests_and_jobs_and_hold_no_secret() {
+    let data = tempfile::tempdir().unwrap();
+    let mut child = Command::new(env!("CARGO_BIN_EXE_heliomap"))
+        .args(["serve", "--insecure", "--listen", "127.0.0.1:0", "--log", "trace", "--log-format", "json"])
+        .env("HELIOMAP_DATA_DIR", data.path())
+        .stdout(Stdio::piped())
+        .stderr(std::fs::File::create(data.path().join("log")).unwrap())
+        .spawn()
+        .unwrap();
+    let mut line = String::new();
+    BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+    let program = Program(child);
+    let base = line.trim().strip_prefix("heliomap is listening on ").unwrap();
+    let client = Client::new();
+    let (secret, password) = ("hm_5ec2e75ec2e75ec2e7", "pa55w0rd");
+    let request = client.get(format!("{base}/api/v1/plants")).header("x-request-id", "call-7").bearer_auth(secret);
+    assert_eq!(request.header("cookie", password).send().unwrap().status(), StatusCode::OK);
+    let key = json!({"name": "first", "scopes": ["read"]});
+    let key: Value = client.post(format!("{base}/api/v1/keys")).json(&key).send().unwrap().json().unwrap();
+    let (_, job) = broken_survey_with_job(&client, base);
+    follow(&client, base, &job);
+    assert!(program.terminate().success());
+    let log = std::fs::read_to_string(data.path().join("log")).unwrap();
+    let lines: Vec<Value> = log.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    assert!(lines.iter().any(|line| line["span"]["id"] == "call-7" && line["status"] == 200), "{log}");
+    assert!(lines.iter().any(|line| line["span"]["job"] == job["id"]), "{log}");
+    for secret in [secret, password, &key["secret"].as_str().unwrap()[11..]] {
+        assert!(!log.contains(secret), "the log holds {secret}");
+    }
+
+    // A database whose URL is wrong.
+    let output = Command::new(env!("CARGO_BIN_EXE_heliomap"))
+        .args(["serve", "--log", "trace", "--data-dir", data.path().to_str().unwrap()])
+        .env("HELIOMAP_DATABASE", format!("postgres://heliomap:{password}@127.0.0.1:port/heliomap"))
+        .output()
+        .unwrap();
+    let text = String::from_utf8_lossy(&output.stderr);
+    assert!(!output.status.success() && text.contains("--database") && !text.contains(password), "{text}");
+}
+
+#[test]
+fn metrics_are_told_on_a_listener_of_their_own() {
+    let data = tempfile::tempdir().unwrap();
+    let mut child = Command::new(env!("CARGO_BIN_EXE_heliomap"))
+        .args(["worker", "--metrics-listen", "127.0.0.1:0"])
+        .env("HELIOMAP_DATA_DIR", data.path())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
+    let _program = Program(child);
+    let address = lines.find_map(|line| line.unwrap().strip_prefix("metrics are on ").map(str::to_owned)).unwrap();
+    let answer = Client::new().get(address).send().unwrap();
+    assert!(answer.headers()["content-type"].to_str().unwrap().starts_with("application/openmetrics-text"));
+    assert!(answer.text().unwrap().contains("heliomap_queue_depth 0"));
+}
