@@ -137,7 +137,7 @@ fn measure(size: usize) -> Figures {
         .map(|((shot, detections), layout)| View { shot, detections, layout })
         .collect();
     let located = clock.stage("locate", || fusion::locate::locate(&views, &cloud));
-    let fused = clock.stage("fuse", || fusion::fuse(&views, &located, &FusionOptions::default()));
+    let fused = clock.stage("fuse", || fusion::fuse(&views, located, &FusionOptions::default()));
     let refined = clock.stage("refine", || refinement::refine(&views, &fused, &RefinementOptions::default()));
     let identity =
         Identity { plant: PlantId::from_name("scaling"), plant_name: "scaling", survey: "flight", previous: None };

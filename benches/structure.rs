@@ -1,6 +1,6 @@
 //! Layout, locate, fusion and refinement on a simulated plant of the paper's size (4974 modules, about 20 photos).
 
-use criterion::{Criterion, criterion_group, criterion_main};
+use criterion::{BatchSize, Criterion, criterion_group, criterion_main};
 use heliomap::fusion::{self, FusionOptions, View};
 use heliomap::layout::{self, Layout, LayoutOptions};
 use heliomap::refinement::{self, RefinementOptions};
@@ -10,7 +10,10 @@ use rand::rngs::StdRng;
 
 fn stages(criterion: &mut Criterion) {
     let spec = PlantSpec::paper_pp1(&mut StdRng::seed_from_u64(1));
-    let simulation = simulate(&spec, &Flight::paper_pp1(), &Errors::paper(), 1);
+    // As many points as the paper's cloud has (4.1).
+    let errors = Errors { cloud_points_per_m2: POINTS_PER_M2, ..Errors::paper() };
+    let simulation = simulate(&spec, &Flight::paper_pp1(), &errors, 1);
+    let detections: usize = simulation.detections.iter().map(|image| image.detections.len()).sum();
     let lay_out = || -> Vec<Layout> {
         let infer = |detections| layout::infer(detections, None, &LayoutOptions::default());
         simulation.detections.iter().map(infer).collect()
@@ -26,14 +29,28 @@ fn stages(criterion: &mut Criterion) {
         .collect();
     let cloud = simulation.reconstruction.dense.clone().unwrap_or_default();
     let located = fusion::locate::locate(&views, &cloud);
-    let fused = fusion::fuse(&views, &located, &FusionOptions::default());
+    let fused = fusion::fuse(&views, located.clone(), &FusionOptions::default());
 
     let mut group = criterion.benchmark_group("paper-sized plant");
     group.sample_size(10);
     group.bench_function("layout", |b| b.iter(lay_out));
     group.bench_function("locate", |b| b.iter(|| fusion::locate::locate(&views, &cloud)));
-    group.bench_function("fuse", |b| b.iter(|| fusion::fuse(&views, &located, &FusionOptions::default())));
+    group.bench_function("fuse", |b| {
+        b.iter_batched(
+            || located.clone(),
+            |located| fusion::fuse(&views, located, &FusionOptions::default()),
+            BatchSize::PerIteration,
+        );
+    });
     group.bench_function("refine", |b| b.iter(|| refinement::refine(&views, &fused, &RefinementOptions::default())));
+    let points = cloud.positions_m.len() as f64 / 1e6;
+    group.bench_function(format!("{detections} detections, {points:.2} million points: locate to refine"), |b| {
+        b.iter(|| {
+            let located = fusion::locate::locate(&views, &cloud);
+            let fused = fusion::fuse(&views, located, &FusionOptions::default());
+            refinement::refine(&views, &fused, &RefinementOptions::default())
+        });
+    });
     group.finish();
 }
 

@@ -325,7 +325,7 @@ pub fn map_folder(
         .collect();
     let located = clock.stage(Stage::Locate, || fusion::locate::locate(&views, &cloud))?;
     let fusion_options = FusionOptions { rows_per_bench: options.rows_per_bench, ..FusionOptions::default() };
-    let fused = clock.stage(Stage::Fuse, || fusion::fuse(&views, &located, &fusion_options))?;
+    let fused = clock.stage(Stage::Fuse, || fusion::fuse(&views, located, &fusion_options))?;
     if fused.benches.is_empty() {
         return Err(MapError::Input {
             code: "no_benches",

@@ -8,7 +8,7 @@
 
 use super::cluster::{Best, Link, Partition, Shift, Table, partition};
 use super::disparity::{Disparity, DisparityField};
-use super::{Doubt, FusionOptions, LocatedPiece, View};
+use super::{Doubt, FusionOptions, LocatedPiece, OpenDoubt, View};
 use crate::layout::End;
 use nalgebra::Vector2;
 use rayon::prelude::*;
@@ -95,12 +95,22 @@ impl Undecided {
     }
 
     /// The sentence for a person.
-    pub(super) fn describe(&self, views: &[View<'_>], pieces: &[LocatedPiece]) -> Doubt {
+    pub(super) fn describe(&self, views: &[View<'_>], pieces: &[LocatedPiece], clusters: &Clusters) -> OpenDoubt {
+        let (Self::Conflict { a, b, .. } | Self::Unsure { a, b, .. }) = self;
+        OpenDoubt {
+            doubt: self.doubt(views, pieces),
+            clusters: [a, b].map(|piece| clusters.placements[*piece].cluster).to_vec(),
+        }
+    }
+
+    fn doubt(&self, views: &[View<'_>], pieces: &[LocatedPiece]) -> Doubt {
         let name = |piece: usize| views[pieces[piece].view].shot.name.clone();
         let at = |piece: usize| {
             let middle = pieces[piece].middle();
             format!("{:.1} m east, {:.1} m north", middle.x, middle.y)
         };
+        let (Self::Conflict { a, b, .. } | Self::Unsure { a, b, .. }) = self;
+        let places_m = vec![pieces[*a].middle(), pieces[*b].middle()];
         match self {
             Self::Conflict { a, b, columns, rows, pairs } => Doubt {
                 code: "bench_conflict",
@@ -114,6 +124,8 @@ impl Undecided {
                     pairs - 1
                 ),
                 images: vec![name(*a), name(*b)],
+                benches: Vec::new(),
+                places_m,
             },
             Self::Unsure { a, b, choices, margin } => {
                 let choices: Vec<String> =
@@ -130,6 +142,8 @@ impl Undecided {
                         choices.join(" or ")
                     ),
                     images: vec![name(*a), name(*b)],
+                    benches: Vec::new(),
+                    places_m,
                 }
             }
         }
@@ -145,6 +159,8 @@ pub struct Clusters {
     /// How sure each bench is: by how much its least sure piece stands better where it is than anywhere else (infinite
     /// with one member).
     pub margins: Vec<f64>,
+    /// Whether, in the same image, another piece stands behind each one's west end, and behind its east end.
+    pub faced: Vec<[bool; 2]>,
     pub(super) doubts: Vec<Undecided>,
 }
 
@@ -152,7 +168,8 @@ pub struct Clusters {
 pub fn associate(pieces: &[LocatedPiece], options: &FusionOptions) -> Clusters {
     let near = near_pairs(pieces, options);
     let pairs: Vec<Pair> = near.par_iter().filter_map(|&(a, b)| pair(a, b, pieces, options)).collect();
-    let apart: Vec<Link> = near.par_iter().filter_map(|&(a, b)| gap_between(a, b, pieces)).collect();
+    let facing: Vec<Facing> = near.par_iter().filter_map(|&(a, b)| facing(a, b, pieces)).collect();
+    let apart: Vec<Link> = facing.iter().filter_map(gap_between).collect();
     let views = pieces.iter().map(|piece| piece.view + 1).max().unwrap_or(0);
     let mut field = DisparityField::unknown(views);
     for needed in [SURE, LIKELY, LIKELY] {
@@ -177,8 +194,14 @@ pub fn associate(pieces: &[LocatedPiece], options: &FusionOptions) -> Clusters {
         outcome = Some((joined, links));
     }
     match outcome {
-        Some((joined, links)) => clusters(&joined, &links),
-        None => Clusters { placements: Vec::new(), members: Vec::new(), margins: Vec::new(), doubts: Vec::new() },
+        Some((joined, links)) => clusters(&joined, &links, &facing),
+        None => Clusters {
+            placements: Vec::new(),
+            members: Vec::new(),
+            margins: Vec::new(),
+            faced: Vec::new(),
+            doubts: Vec::new(),
+        },
     }
 }
 
@@ -215,33 +238,52 @@ fn table(index: usize, pair: &Pair, pieces: &[LocatedPiece], field: &DisparityFi
     Table::new(pair.hypotheses.iter().map(|h| ((h.col, h.row), cost(h))), FAR_COST, apart)
 }
 
-/// Two pieces of one image, one behind the other, that no one lattice fits: a gap lies between them, and they are two
-/// benches.
-fn gap_between(a: usize, b: usize, pieces: &[LocatedPiece]) -> Option<Link> {
+/// Two pieces of one image, one behind the other.
+struct Facing {
+    west: usize,
+    east: usize,
+    /// Where the nearest module of the smaller piece stands on the lattice of the larger one, columns from its end.
+    beyond: f64,
+}
+
+/// Whether two pieces are of one image and stand one behind the other.
+fn facing(a: usize, b: usize, pieces: &[LocatedPiece]) -> Option<Facing> {
     /// Farther off a lattice is too little known to tell, columns.
     const NEAR: f64 = 3.0;
     let (first, second) = (&pieces[a], &pieces[b]);
     if first.view != second.view {
         return None;
     }
-    let (base, part) = if first.cells.len() >= second.cells.len() { (first, second) } else { (second, first) };
+    let ((base, base_piece), (part, part_piece)) =
+        if first.cells.len() >= second.cells.len() { ((first, a), (second, b)) } else { ((second, b), (first, a)) };
     let outside = |at: &Vector2<f64>| (-at.x).max(at.x - f64::from(base.cols - 1));
-    let facing = part
+    let nearest = part
         .cells
         .iter()
         .filter(|cell| cell.detection.is_some())
         .filter_map(|cell| base.ground.coordinate(cell.position_m.xy()))
         .filter(|at| (-0.4..f64::from(base.rows) - 0.6).contains(&at.y))
         .min_by(|p, q| outside(p).total_cmp(&outside(q)))?;
-    let beyond = outside(&facing);
-    if !(0.5..NEAR).contains(&beyond) || (facing.x - facing.x.round()).abs() < 0.15 + 0.03 * beyond {
-        return None;
-    }
-    Some(Link { a, b, table: Table::new([], GAP_COST, 0.0) })
+    let beyond = outside(&nearest);
+    let (west, east) = if nearest.x < 0.0 { (part_piece, base_piece) } else { (base_piece, part_piece) };
+    (0.5..NEAR).contains(&beyond).then_some(Facing { west, east, beyond })
+}
+
+/// Two pieces of one image, one behind the other, that no one lattice fits: a gap lies between them, and they are two
+/// benches.
+fn gap_between(facing: &Facing) -> Option<Link> {
+    let Facing { west, east, beyond } = *facing;
+    let off = (beyond - beyond.round()).abs();
+    (off >= 0.15 + 0.03 * beyond).then(|| Link { a: west, b: east, table: Table::new([], GAP_COST, 0.0) })
 }
 
 /// The benches of a partition, numbered by their first piece, with what it leaves open.
-fn clusters(joined: &Partition, links: &[Link]) -> Clusters {
+fn clusters(joined: &Partition, links: &[Link], facing: &[Facing]) -> Clusters {
+    let mut faced = vec![[false; 2]; joined.set.len()];
+    for pair in facing {
+        faced[pair.west][1] = true;
+        faced[pair.east][0] = true;
+    }
     let mut number: BTreeMap<usize, usize> = BTreeMap::new();
     let mut members: Vec<Vec<usize>> = Vec::new();
     let mut margins: Vec<f64> = Vec::new();
@@ -266,7 +308,7 @@ fn clusters(joined: &Partition, links: &[Link]) -> Clusters {
         }
     }
     let doubts = undecided(joined, links, &number);
-    Clusters { placements, members, margins, doubts }
+    Clusters { placements, members, margins, faced, doubts }
 }
 
 /// What is left open: in each bench the clearest pair that contradicts it, and sets of pieces that lie over each other

@@ -3,7 +3,7 @@
 
 use super::associate::Clusters;
 use super::locate::LocatedCell;
-use super::{Doubt, LocatedPiece, View};
+use super::{Doubt, LocatedPiece, OpenDoubt, View};
 use crate::layout::End;
 use nalgebra::{Vector2, Vector3};
 use rstar::RTree;
@@ -50,6 +50,8 @@ pub struct FusedBench {
     pub middle_m: Vector3<f64>,
     /// Mean metres per column and per row in the horizontal plane.
     pub pitch_m: [Vector2<f64>; 2],
+    /// The set of pieces that it is made of.
+    pub(super) cluster: usize,
 }
 
 /// What the views say of one place in a bench.
@@ -63,28 +65,23 @@ struct Votes {
 }
 
 /// Assembles the benches from their pieces.
-pub fn assemble(
+pub(super) fn assemble(
     views: &[View<'_>],
     pieces: &[LocatedPiece],
     clusters: &Clusters,
-    doubts: &mut Vec<Doubt>,
+    doubts: &mut Vec<OpenDoubt>,
 ) -> Vec<FusedBench> {
-    clusters
-        .members
-        .iter()
-        .zip(&clusters.margins)
-        .filter_map(|(members, margin)| assemble_bench(views, pieces, clusters, members, *margin, doubts))
-        .collect()
+    (0..clusters.members.len()).filter_map(|cluster| assemble_bench(views, pieces, clusters, cluster, doubts)).collect()
 }
 
 fn assemble_bench(
     views: &[View<'_>],
     pieces: &[LocatedPiece],
     clusters: &Clusters,
-    members: &[usize],
-    margin: f64,
-    doubts: &mut Vec<Doubt>,
+    cluster: usize,
+    doubts: &mut Vec<OpenDoubt>,
 ) -> Option<FusedBench> {
+    let (members, margin) = (&clusters.members[cluster], clusters.margins[cluster]);
     let mut votes: BTreeMap<(i32, i32), Votes> = BTreeMap::new();
     for &member in members {
         let (piece, place) = (&pieces[member], clusters.placements[member]);
@@ -169,6 +166,7 @@ fn assemble_bench(
         confidence: (joint * (1.0 - 0.5 * f64::from(holes) / f64::from(rows * cols))).clamp(0.0, 1.0),
         middle_m,
         pitch_m: [mean_pitch(0), mean_pitch(1)],
+        cluster,
     };
     doubts.extend(holes_to_check(views, &bench));
     Some(bench)
@@ -263,7 +261,11 @@ impl Extent {
 
 /// Takes out benches that stand on top of another one: the same bench once more, which the evidence could not join. The
 /// one with fewer observations goes, and it is told.
-pub fn without_ghosts(views: &[View<'_>], benches: Vec<FusedBench>, doubts: &mut Vec<Doubt>) -> Vec<FusedBench> {
+pub(super) fn without_ghosts(
+    views: &[View<'_>],
+    benches: Vec<FusedBench>,
+    doubts: &mut Vec<OpenDoubt>,
+) -> Vec<FusedBench> {
     let position = |module: &FusedModule| {
         let count = module.observations.len() as f64;
         module.observations.iter().map(|o| o.position_m.xy()).sum::<Vector2<f64>>() / count
@@ -326,15 +328,23 @@ pub fn without_ghosts(views: &[View<'_>], benches: Vec<FusedBench>, doubts: &mut
                 .flat_map(|m| m.observations.iter().map(|o| views[o.view].shot.name.clone()))
                 .collect();
             let at = over.map_or(bench.middle_m, |k| benches[k].middle_m);
-            doubts.push(Doubt {
+            let clusters = std::iter::once(bench.cluster).chain(over.map(|k| benches[k].cluster)).collect();
+            let doubt = Doubt {
                 code: "bench_seen_apart",
                 message: format!(
                     "{} modules seen at {:.1} m east, {:.1} m north lie over the bench at {:.1} m east, {:.1} m north, but \
                      do not fit its lattice; they are left out: check these images",
-                    bench.modules.len(), bench.middle_m.x, bench.middle_m.y, at.x, at.y
+                    bench.modules.len(),
+                    bench.middle_m.x,
+                    bench.middle_m.y,
+                    at.x,
+                    at.y
                 ),
                 images: names.into_iter().collect(),
-            });
+                benches: Vec::new(),
+                places_m: vec![bench.middle_m.xy()],
+            };
+            doubts.push(OpenDoubt { doubt, clusters });
         }
     }
     benches.into_iter().zip(kept).filter_map(|(bench, keep)| keep.then_some(bench)).collect()
@@ -370,7 +380,7 @@ fn views_missing(views: &[View<'_>], bench: &FusedBench) -> usize {
 }
 
 /// Places inside the bench where no view detected a module: said, not filled.
-fn holes_to_check(views: &[View<'_>], bench: &FusedBench) -> Option<Doubt> {
+fn holes_to_check(views: &[View<'_>], bench: &FusedBench) -> Option<OpenDoubt> {
     let present: BTreeSet<(i32, i32)> = bench.modules.iter().map(|m| (m.row, m.col)).collect();
     let missing: Vec<String> = (0..bench.rows)
         .flat_map(|row| (0..bench.cols).map(move |col| (row, col)))
@@ -384,7 +394,7 @@ fn holes_to_check(views: &[View<'_>], bench: &FusedBench) -> Option<Doubt> {
         bench.modules.iter().flat_map(|m| m.observations.iter().map(|o| views[o.view].shot.name.as_str())).collect();
     let shown = missing.iter().take(6).cloned().collect::<Vec<_>>().join(", ");
     let more = if missing.len() > 6 { format!(" and {} more", missing.len() - 6) } else { String::new() };
-    Some(Doubt {
+    let doubt = Doubt {
         code: "modules_not_seen",
         message: format!(
             "the bench at {:.1} m east, {:.1} m north has {} places where no image shows a module ({shown}{more}): they \
@@ -394,5 +404,8 @@ fn holes_to_check(views: &[View<'_>], bench: &FusedBench) -> Option<Doubt> {
             missing.len(),
         ),
         images: images.into_iter().map(str::to_owned).collect(),
-    })
+        benches: Vec::new(),
+        places_m: vec![bench.middle_m.xy()],
+    };
+    Some(OpenDoubt { doubt, clusters: vec![bench.cluster] })
 }

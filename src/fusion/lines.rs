@@ -1,12 +1,16 @@
 //! Benches one behind the other form lines.
 
-use super::FusedBench;
+use super::{Doubt, FusedBench, OpenDoubt};
 use nalgebra::Vector2;
 
 /// How far apart the ends of two benches of one line may stand (a road lies between them), metres.
 const WIDEST_M: f64 = 15.0;
 /// How far the axes of two benches of one line may be turned against each other, degrees.
 const BEND_DEG: f64 = 12.0;
+/// Benches of one line face each other by their ends: how far aside of each other their middles may stand, as a share of
+/// half their widths together, and up to where it is doubtful.
+const ASIDE: f64 = 0.85;
+const DOUBTFUL_ASIDE: f64 = 1.05;
 
 /// A line: its benches from the west.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -44,7 +48,7 @@ impl Footprint {
 
 /// Groups benches into lines and sorts both: lines from the north, benches from the west (where rows run north-south:
 /// lines from the east, benches from the north).
-pub fn arrange(benches: Vec<FusedBench>) -> (Vec<FusedLine>, Vec<FusedBench>) {
+pub(super) fn arrange(benches: Vec<FusedBench>, doubts: &mut Vec<OpenDoubt>) -> (Vec<FusedLine>, Vec<FusedBench>) {
     let footprints: Vec<Footprint> = benches.iter().map(Footprint::of).collect();
     let count = benches.len();
     let cell_m = WIDEST_M;
@@ -55,6 +59,7 @@ pub fn arrange(benches: Vec<FusedBench>) -> (Vec<FusedLine>, Vec<FusedBench>) {
     }
     // (distance, from, to): the east end of one faces the west end of the other.
     let mut facing: Vec<(f64, usize, usize)> = Vec::new();
+    let mut doubtful: Vec<(usize, usize)> = Vec::new();
     for (i, from) in footprints.iter().enumerate() {
         let home = key(from.east);
         for dx in -2..=2 {
@@ -66,8 +71,14 @@ pub fn arrange(benches: Vec<FusedBench>) -> (Vec<FusedLine>, Vec<FusedBench>) {
                     }
                     let offset = to.west - from.east;
                     let (gap, aside) = (offset.dot(&from.along), offset.dot(&from.across));
-                    if (-1.0..WIDEST_M).contains(&gap) && aside.abs() < 0.6 * (from.half_m + to.half_m) + 0.05 * gap {
+                    let within = |share: f64| aside.abs() < share * (from.half_m + to.half_m) + 0.05 * gap;
+                    if !(-1.0..WIDEST_M).contains(&gap) {
+                        continue;
+                    }
+                    if within(ASIDE) {
                         facing.push((gap.max(0.0) + 2.0 * aside.abs(), i, j));
+                    } else if within(DOUBTFUL_ASIDE) {
+                        doubtful.push((i, j));
                     }
                 }
             }
@@ -82,6 +93,13 @@ pub fn arrange(benches: Vec<FusedBench>) -> (Vec<FusedLine>, Vec<FusedBench>) {
             previous[j] = Some(i);
         }
     }
+    doubtful.sort_unstable();
+    doubts.extend(
+        doubtful
+            .into_iter()
+            .filter(|&(i, j)| next[i].is_none() && previous[j].is_none())
+            .map(|(i, j)| line_unsure(&benches[i], &benches[j])),
+    );
     let mut seen = vec![false; count];
     let mut lines: Vec<Vec<usize>> = Vec::new();
     for start in (0..count).filter(|k| previous[*k].is_none()).chain(0..count) {
@@ -127,4 +145,21 @@ pub fn arrange(benches: Vec<FusedBench>) -> (Vec<FusedLine>, Vec<FusedBench>) {
     let mut slots: Vec<Option<FusedBench>> = benches.into_iter().map(Some).collect();
     let sorted = order.into_iter().filter_map(|old| slots[old].take()).collect();
     (lines, sorted)
+}
+
+/// Two benches that may be of one line, or of two lines beside each other.
+fn line_unsure(west: &FusedBench, east: &FusedBench) -> OpenDoubt {
+    let (from, to) = (west.middle_m.xy(), east.middle_m.xy());
+    let doubt = Doubt {
+        code: "line_unsure",
+        message: format!(
+            "the benches at {:.1} m east, {:.1} m north and {:.1} m east, {:.1} m north face each other by the corners of \
+             their ends alone: they are taken as of two lines, but may be of one",
+            from.x, from.y, to.x, to.y
+        ),
+        images: Vec::new(),
+        benches: Vec::new(),
+        places_m: vec![from, to],
+    };
+    OpenDoubt { doubt, clusters: vec![west.cluster, east.cluster] }
 }

@@ -103,7 +103,7 @@ impl LocatedPiece {
 }
 
 /// All pieces of all views in 3D.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Located {
     pub pieces: Vec<LocatedPiece>,
 }

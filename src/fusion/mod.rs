@@ -15,6 +15,8 @@ use crate::reconstruction::Shot;
 pub use benches::{FusedBench, FusedModule, Observation};
 pub use lines::FusedLine;
 pub use locate::{Located, LocatedPiece};
+use nalgebra::Vector2;
+use std::collections::HashMap;
 
 /// One image with all that is known of it.
 #[derive(Debug, Clone, Copy)]
@@ -48,6 +50,32 @@ pub struct Doubt {
     pub message: String,
     /// Images concerned.
     pub images: Vec<String>,
+    /// Benches of [`Fused::benches`] concerned, sorted; those that were left out have no number.
+    pub benches: Vec<usize>,
+    /// Where: the middle of everything concerned, left out or not, east and north in metres.
+    pub places_m: Vec<Vector2<f64>>,
+}
+
+/// A doubt while benches have no numbers yet: it names the sets of pieces that they are made of.
+#[derive(Debug)]
+struct OpenDoubt {
+    doubt: Doubt,
+    clusters: Vec<usize>,
+}
+
+/// Benches get their numbers, and doubts name them.
+fn close(doubts: Vec<OpenDoubt>, benches: &[FusedBench]) -> Vec<Doubt> {
+    let number: HashMap<usize, usize> =
+        benches.iter().enumerate().map(|(number, bench)| (bench.cluster, number)).collect();
+    doubts
+        .into_iter()
+        .map(|OpenDoubt { mut doubt, clusters }| {
+            doubt.benches = clusters.iter().filter_map(|cluster| number.get(cluster).copied()).collect();
+            doubt.benches.sort_unstable();
+            doubt.benches.dedup();
+            doubt
+        })
+        .collect()
 }
 
 /// The structure of the whole plant.
@@ -60,9 +88,9 @@ pub struct Fused {
 }
 
 /// Fuses located pieces into the structure of the plant. The result does not depend on the order of the views.
-pub fn fuse(views: &[View<'_>], located: &Located, options: &FusionOptions) -> Fused {
+pub fn fuse(views: &[View<'_>], located: Located, options: &FusionOptions) -> Fused {
     let mut doubts = Vec::new();
-    let mut pieces = located.pieces.clone();
+    let mut pieces = located.pieces;
     let mut clusters = associate::associate(&pieces, options);
     // A keypoint missed in one image lets one piece run over two benches; the other images tell where to split it.
     for _ in 0..3 {
@@ -73,9 +101,10 @@ pub fn fuse(views: &[View<'_>], located: &Located, options: &FusionOptions) -> F
         pieces = repair::split(pieces, &splits);
         clusters = associate::associate(&pieces, options);
     }
-    doubts.extend(clusters.doubts.iter().map(|doubt| doubt.describe(views, &pieces)));
+    doubts.extend(clusters.doubts.iter().map(|doubt| doubt.describe(views, &pieces, &clusters)));
     let benches = benches::assemble(views, &pieces, &clusters, &mut doubts);
     let benches = benches::without_ghosts(views, benches, &mut doubts);
-    let (lines, benches) = lines::arrange(benches);
+    let (lines, benches) = lines::arrange(benches, &mut doubts);
+    let doubts = close(doubts, &benches);
     Fused { lines, benches, doubts }
 }

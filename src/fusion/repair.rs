@@ -5,7 +5,8 @@ use super::associate::Clusters;
 use crate::layout::End;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// A piece that runs over a bench gap: it is to end after this column.
+/// A piece that runs over a bench gap, or ends at one: it is to end after this column (its last if it ends there, -1 if it
+/// begins there).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Split {
     pub piece: usize,
@@ -21,19 +22,32 @@ pub fn missed_gaps(pieces: &[LocatedPiece], clusters: &Clusters) -> Vec<Split> {
         // Column after which a piece ends, and after which the next one begins -> views that say so.
         let mut ends: BTreeMap<i32, BTreeSet<usize>> = BTreeMap::new();
         let mut begins: BTreeMap<i32, BTreeSet<usize>> = BTreeMap::new();
+        // Likewise of views that show the next bench behind the end, which need not have come into this set.
+        let mut faced: BTreeMap<i32, BTreeSet<usize>> = BTreeMap::new();
         for &member in members {
             let (piece, place) = (&pieces[member], clusters.placements[member]);
             if piece.east == End::Closed {
-                ends.entry(place.col + piece.cols - 1).or_default().insert(piece.view);
+                let after = place.col + piece.cols - 1;
+                ends.entry(after).or_default().insert(piece.view);
+                if clusters.faced[member][1] {
+                    faced.entry(after).or_default().insert(piece.view);
+                }
             }
             if piece.west == End::Closed {
                 begins.entry(place.col - 1).or_default().insert(piece.view);
+                if clusters.faced[member][0] {
+                    faced.entry(place.col - 1).or_default().insert(piece.view);
+                }
             }
         }
         let places: BTreeSet<i32> = ends.keys().chain(begins.keys()).copied().collect();
         for after in places {
-            let ending = ends.get(&after).cloned().unwrap_or_default();
+            let mut ending = ends.get(&after).cloned().unwrap_or_default();
             let mut beginning = begins.get(&after).cloned().unwrap_or_default();
+            for view in faced.get(&after).into_iter().flatten() {
+                ending.insert(*view);
+                beginning.insert(*view);
+            }
             if !ending.is_empty() {
                 // A gap of more than half a module puts the next bench a column further.
                 beginning.extend(begins.get(&(after + 1)).into_iter().flatten());
@@ -76,12 +90,10 @@ pub fn missed_gaps(pieces: &[LocatedPiece], clusters: &Clusters) -> Vec<Split> {
     splits
 }
 
-/// Columns that two views or more bridge, or at which two or more see the benches end, and in which none ever saw a
-/// module: missed modules would be seen by some view, so this is a gap.
+/// Columns in which no view ever saw a module, though two views or more show modules on both sides of them: missed modules
+/// would be seen by some view, so this is a gap. Pieces that run over it are cut, and those that end at it end there for
+/// good.
 fn empty_columns(pieces: &[LocatedPiece], clusters: &Clusters, members: &[usize]) -> Vec<Split> {
-    if members.iter().all(|member| pieces[*member].bridges.is_empty()) {
-        return Vec::new();
-    }
     let mut seen: BTreeSet<i32> = BTreeSet::new();
     for &member in members {
         let cells = pieces[member].cells.iter().filter(|cell| cell.detection.is_some());
@@ -90,21 +102,27 @@ fn empty_columns(pieces: &[LocatedPiece], clusters: &Clusters, members: &[usize]
     let (Some(&first), Some(&last)) = (seen.first(), seen.last()) else { return Vec::new() };
     let mut splits = Vec::new();
     for col in (first..last).filter(|col| seen.contains(col) && !seen.contains(&(col + 1))) {
-        let across: Vec<Split> = members
-            .iter()
-            .map(|&piece| Split { piece, after_col: col - clusters.placements[piece].col })
-            .filter(|split| (0..pieces[split.piece].cols - 1).contains(&split.after_col))
-            .collect();
         let next = seen.range(col + 1..).next().copied().unwrap_or(last);
-        let ending = members.iter().filter(|&&member| {
+        // Views that show something west of it, or see the next bench begin; and east of it likewise.
+        let (mut west, mut east) = (BTreeSet::new(), BTreeSet::new());
+        let mut cuts = Vec::new();
+        for &member in members {
             let (piece, place) = (&pieces[member], clusters.placements[member]);
-            (piece.east == End::Closed && place.col + piece.cols - 1 == col)
-                || (piece.west == End::Closed && place.col == next)
-        });
-        let bridging = across.iter().map(|split| split.piece);
-        let views: BTreeSet<usize> = ending.copied().chain(bridging).map(|piece| pieces[piece].view).collect();
-        if views.len() > 1 {
-            splits.extend(across);
+            let (low, high) = (place.col, place.col + piece.cols - 1);
+            if low <= col || (low == next && piece.west == End::Closed) {
+                west.insert(piece.view);
+            }
+            if high >= next || (high == col && piece.east == End::Closed) {
+                east.insert(piece.view);
+            }
+            let ends_open = (high == col && piece.east == End::Cut) || (low == next && piece.west == End::Cut);
+            if (low <= col && high >= next) || ends_open {
+                let after_col = if low == next { -1 } else { col - low };
+                cuts.push(Split { piece: member, after_col });
+            }
+        }
+        if west.intersection(&east).count() > 1 {
+            splits.extend(cuts);
         }
     }
     splits
@@ -120,7 +138,7 @@ pub fn split(pieces: Vec<LocatedPiece>, splits: &[Split]) -> Vec<LocatedPiece> {
         for split in splits.iter().filter(|split| split.piece == index) {
             let Some(current) = rest.take() else { break };
             let after = split.after_col - start;
-            if after < 0 {
+            if after < -1 {
                 rest = Some(current);
                 continue;
             }

@@ -6,7 +6,7 @@ use super::extract::{ApiPath, ApiQuery};
 use super::paging::{List, PageQuery};
 use super::surveys::missing_views;
 use crate::pipeline::{MapOptions, Stage};
-use crate::plant::{PlantId, Warning};
+use crate::plant::{BenchId, PlantId, Warning};
 use crate::refinement::Control;
 use crate::store::{Cancelled, Enqueued, Job, JobId, JobRequest, JobState, SurveyId};
 use axum::Json;
@@ -164,11 +164,14 @@ pub struct WarningView {
     pub message: String,
     /// Images concerned, sorted.
     pub images: Vec<String>,
+    /// Benches concerned, by their identifiers; what was left out of the model has none.
+    #[schema(value_type = Vec<Uuid>)]
+    pub benches: Vec<BenchId>,
 }
 
 impl From<Warning> for WarningView {
     fn from(warning: Warning) -> Self {
-        Self { code: warning.code, message: warning.message, images: warning.images }
+        Self { code: warning.code, message: warning.message, images: warning.images, benches: warning.benches }
     }
 }
 

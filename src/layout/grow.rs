@@ -103,6 +103,8 @@ pub(super) fn grow(
     for component in &mut grown {
         drop_outliers(component, &nodes);
     }
+    // What is joined is judged along the row, so the row must be known first; what was joined may tell more of it.
+    orient(&mut grown, &nodes);
     join(&mut grown, &nodes, detections, grey, options);
     grown.retain(|component| component.places.len() >= 2);
     orient(&mut grown, &nodes);

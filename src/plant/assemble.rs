@@ -2,7 +2,7 @@
 
 use super::ids::{BenchId, LineId, ModuleId, PlantId, SectorId};
 use super::model::{Bench, Line, Module, ModuleStatus, PlantModel, Sector, Warning};
-use crate::fusion::{Fused, View};
+use crate::fusion::{Doubt, Fused, View};
 use crate::geometry::GeodeticReference;
 use crate::refinement::{Refined, RefinedBench};
 use nalgebra::{Vector2, Vector3};
@@ -57,6 +57,7 @@ pub fn assemble(
         serials: [0; 4],
     };
     let mut next_draft = 0;
+    let mut named: Vec<Option<(BenchId, String)>> = vec![None; fused.benches.len()];
     for (line_index, line) in fused.lines.iter().enumerate() {
         let line_label = format!("L{:02}", line_index + 1);
         let line_id = registry.line(line_index);
@@ -65,6 +66,7 @@ pub fn assemble(
             let bench = &fused.benches[bench_index];
             let bench_label = format!("{line_label}-B{:02}", bench_in_line + 1);
             let bench_id = registry.bench(bench_index);
+            named[bench_index] = Some((bench_id, bench_label.clone()));
             model.benches.push(Bench {
                 id: bench_id,
                 label: bench_label.clone(),
@@ -118,14 +120,25 @@ pub fn assemble(
             }
         }
     }
-    warnings.extend(
-        fused.doubts.iter().map(|doubt| Warning::new(doubt.code, doubt.message.clone(), doubt.images.iter().cloned())),
-    );
+    warnings.extend(fused.doubts.iter().map(|doubt| warning(doubt, &named)));
     warnings.sort();
     warnings.dedup();
     model.warnings = warnings;
     model.serials = registry.serials;
     model
+}
+
+/// What a doubt tells a person: benches by their labels, as on the map.
+fn warning(doubt: &Doubt, named: &[Option<(BenchId, String)>]) -> Warning {
+    let (mut benches, labels): (Vec<BenchId>, Vec<&str>) = doubt
+        .benches
+        .iter()
+        .filter_map(|bench| named[*bench].as_ref().map(|(id, label)| (*id, label.as_str())))
+        .unzip();
+    benches.sort_unstable();
+    let message =
+        if labels.is_empty() { doubt.message.clone() } else { format!("{}: {}", labels.join(", "), doubt.message) };
+    Warning { benches, ..Warning::new(doubt.code, message, doubt.images.iter().cloned()) }
 }
 
 /// A module on its way into the model.

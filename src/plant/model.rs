@@ -119,6 +119,9 @@ pub struct Warning {
     /// Images concerned, sorted.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub images: Vec<String>,
+    /// Benches concerned, sorted; what was left out of the model has none.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub benches: Vec<BenchId>,
 }
 
 impl Warning {
@@ -127,7 +130,7 @@ impl Warning {
         let mut images: Vec<String> = images.into_iter().collect();
         images.sort();
         images.dedup();
-        Self { code: code.to_owned(), message: message.into(), images }
+        Self { code: code.to_owned(), message: message.into(), images, benches: Vec::new() }
     }
 }
 

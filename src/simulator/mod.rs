@@ -45,7 +45,7 @@ pub use plant::{
     BenchSpec, BlockSpec, LineCurve, LineSpec, PlantSpec, PlantTruth, Terrain, TerrainWave, TruthBench, TruthLine,
     TruthModule,
 };
-pub use report::{FoundModule, StructureReport, structure_report};
+pub use report::{FoundModule, StructureReport, WrongStructure, structure_report};
 
 use crate::detection::ImageDetections;
 use crate::reconstruction::{Reconstruction, Shot};

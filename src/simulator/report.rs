@@ -1,6 +1,6 @@
 //! Is a found structure the true one?
 
-use super::plant::{ModuleGrid, PlantTruth};
+use super::plant::{ModuleGrid, PlantTruth, TruthModule};
 use nalgebra::{Matrix2, Vector2, Vector3};
 use rstar::{RTree, primitives::GeomWithData};
 use std::collections::BTreeMap;
@@ -25,12 +25,21 @@ pub struct StructureReport {
     pub missing: Vec<usize>,
     /// Found modules where none stands, or a second one where one does (indices into what was found).
     pub false_modules: Vec<usize>,
-    /// What is wrong with lines, benches, rows and numbers: one sentence for each bench or line.
-    pub wrong_structure: Vec<String>,
+    /// What is wrong with lines, benches, rows and numbers, each bench or line once.
+    pub wrong_structure: Vec<WrongStructure>,
     /// Whether nothing differs.
     pub exact: bool,
     /// The true module of every found one.
     pub pairs: Vec<Option<usize>>,
+}
+
+/// A bench or line that is not the true one.
+#[derive(Debug, Clone, PartialEq)]
+pub struct WrongStructure {
+    /// One sentence.
+    pub message: String,
+    /// The found modules concerned: all of the bench, or of the line (indices into what was found).
+    pub modules: Vec<usize>,
 }
 
 /// Compares what was found with the truth. Modules are paired by place, seen from above: a common shift of up to a
@@ -311,8 +320,13 @@ fn wrong_structure(
     found: &[FoundModule],
     pairs: &[Option<usize>],
     benches: &BTreeMap<(&str, &str), Vec<usize>>,
-) -> Vec<String> {
+) -> Vec<WrongStructure> {
     let mut wrong = Vec::new();
+    // All found modules of benches or lines.
+    let of_benches = |is_one: &dyn Fn(&TruthModule) -> bool| -> Vec<usize> {
+        let is_one = |index: &usize| pairs[*index].is_some_and(|pair| is_one(&truth.modules[pair]));
+        (0..found.len()).filter(is_one).collect()
+    };
     let place = |bench: u32| {
         let bench = &truth.benches[bench as usize];
         format!("line {} bench {}", bench.line, bench.index)
@@ -335,24 +349,29 @@ fn wrong_structure(
         }
         if parts.len() > 1 {
             let parts: Vec<String> = parts.iter().map(|(b, count)| format!("{} ({count})", place(*b))).collect();
-            wrong.push(format!("found bench {line}/{bench} joins {}", parts.join(" and ")));
+            let message = format!("found bench {line}/{bench} joins {}", parts.join(" and "));
+            wrong.push(WrongStructure { message, modules: members.clone() });
         }
     }
     for (bench, names) in &true_benches {
         if names.len() > 1 {
-            wrong.push(format!("{} is split over {}", place(*bench), names.join(" and ")));
+            let message = format!("{} is split over {}", place(*bench), names.join(" and "));
+            wrong.push(WrongStructure { message, modules: of_benches(&|module| module.bench == *bench) });
         }
     }
     for (line, names) in &true_lines {
         if names.len() > 1 {
             let names: Vec<String> = names.iter().map(|(name, count)| format!("{name} ({count})")).collect();
-            wrong.push(format!("line {line} is split over found lines {}", names.join(" and ")));
+            let message = format!("line {line} is split over found lines {}", names.join(" and "));
+            wrong.push(WrongStructure { message, modules: of_benches(&|module| module.line == *line) });
         }
     }
     for (name, lines) in &found_lines {
         if lines.len() > 1 {
             let lines: Vec<String> = lines.iter().map(|(line, count)| format!("{line} ({count})")).collect();
-            wrong.push(format!("found line {name} joins lines {}", lines.join(" and ")));
+            let message = format!("found line {name} joins lines {}", lines.join(" and "));
+            let modules = (0..found.len()).filter(|index| found[*index].line == **name).collect();
+            wrong.push(WrongStructure { message, modules });
         }
     }
 
@@ -378,7 +397,8 @@ fn wrong_structure(
         }
     }
     for (bench, (count, example)) in miscounted {
-        wrong.push(format!("{}: {count} modules miscounted, first {example}", place(bench)));
+        let message = format!("{}: {count} modules miscounted, first {example}", place(bench));
+        wrong.push(WrongStructure { message, modules: of_benches(&|module| module.bench == bench) });
     }
     wrong
 }

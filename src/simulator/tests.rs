@@ -336,13 +336,13 @@ fn what_is_wrong_is_named() {
     joined.iter_mut().filter(|m| m.line == "L1" && m.bench == "B2").for_each(|m| "B1".clone_into(&mut m.bench));
     let report = structure_report(&truth, &joined);
     assert!(report.missing.is_empty() && report.false_modules.is_empty() && !report.exact);
-    assert!(report.wrong_structure[0].contains("joins line 0 bench 0"), "{:?}", report.wrong_structure);
+    assert!(report.wrong_structure[0].message.contains("joins line 0 bench 0"), "{:?}", report.wrong_structure);
 
     let mut shifted = found.clone();
     shifted.iter_mut().filter(|m| m.line == "L2" && m.bench == "B1").for_each(|m| m.number += 1);
     let report = structure_report(&truth, &shifted);
     assert_eq!(report.wrong_structure.len(), 1);
-    assert!(report.wrong_structure[0].starts_with("line 1 bench 0"), "{:?}", report.wrong_structure);
+    assert!(report.wrong_structure[0].message.starts_with("line 1 bench 0"), "{:?}", report.wrong_structure);
 
     let mut crossed = found;
     crossed.iter_mut().filter(|m| m.line == "L2").for_each(|m| m.line = String::from("L1"));

@@ -32,7 +32,7 @@ impl Plant {
         let cloud = plant.simulation.reconstruction.dense.clone().unwrap_or_else(|| plant.sparse_cloud());
         let views = plant.views();
         let located = fusion::locate::locate(&views, &cloud);
-        plant.fused = fusion::fuse(&views, &located, &FusionOptions::default());
+        plant.fused = fusion::fuse(&views, located, &FusionOptions::default());
         plant
     }
 

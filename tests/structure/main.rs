@@ -11,10 +11,11 @@ use heliomap::refinement::{self, Refined, RefinementOptions};
 use heliomap::simulator::{
     Errors, Flight, FoundModule, LayoutKind, PlantSpec, Simulation, StructureReport, simulate, structure_report,
 };
+use nalgebra::Vector2;
 use rand::SeedableRng;
 use rand::rngs::StdRng;
 use rayon::prelude::*;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// A simulated plant, mapped.
 struct Mapped {
@@ -45,12 +46,17 @@ impl Mapped {
         let views = views(&simulation, &layouts);
         let cloud = simulation.reconstruction.dense.clone().unwrap();
         let located = fusion::locate::locate(&views, &cloud);
-        let fused = fusion::fuse(&views, &located, &FusionOptions::default());
+        let fused = fusion::fuse(&views, located, &FusionOptions::default());
         let refined = refinement::refine(&views, &fused, &RefinementOptions::default());
         Self { simulation, layouts, fused, refined }
     }
 
     fn report(&self) -> StructureReport {
+        structure_report(&self.simulation.truth, &self.found())
+    }
+
+    /// All modules, line by line and bench by bench.
+    fn found(&self) -> Vec<FoundModule> {
         let mut found = Vec::new();
         for (line, members) in self.fused.lines.iter().enumerate() {
             for &bench in &members.benches {
@@ -67,12 +73,72 @@ impl Mapped {
                 }
             }
         }
-        structure_report(&self.simulation.truth, &found)
+        found
     }
 
-    /// Modules that no photo shows cannot be found.
-    fn never_seen(&self) -> usize {
-        self.simulation.sightings().iter().filter(|count| **count == 0).count()
+    /// What differs from the truth: a sentence each, whether a doubt names the place, and what that says. Modules that no
+    /// photo shows cannot be found.
+    fn wrongs(&self) -> Vec<Wrong> {
+        let report = self.report();
+        let truth = &self.simulation.truth;
+        let bench_of: Vec<usize> = self
+            .fused
+            .lines
+            .iter()
+            .flat_map(|line| &line.benches)
+            .flat_map(|bench| std::iter::repeat_n(*bench, self.fused.benches[*bench].modules.len()))
+            .collect();
+        let mut wrongs: Vec<Wrong> = report
+            .wrong_structure
+            .iter()
+            .map(|wrong| {
+                let found = wrong.modules.iter().map(|index| bench_of[*index]).collect();
+                let ours = wrong.modules.iter().filter_map(|index| report.pairs[*index]);
+                let true_benches = ours.map(|module| truth.modules[module].bench).collect();
+                self.wrong(wrong.message.clone(), &found, &true_benches, false)
+            })
+            .collect();
+        for module in &report.false_modules {
+            let bench = bench_of[*module];
+            wrongs.push(self.wrong(format!("false module in found bench {bench}"), &[bench].into(), &[].into(), false));
+        }
+        let sightings = self.simulation.sightings();
+        let mut missing: BTreeMap<u32, usize> = BTreeMap::new();
+        for module in report.missing.iter().filter(|module| sightings[**module] > 0) {
+            *missing.entry(truth.modules[*module].bench).or_default() += 1;
+        }
+        for (bench, count) in missing {
+            let found = report.pairs.iter().zip(&bench_of);
+            let found = found.filter(|(pair, _)| pair.is_some_and(|m| truth.modules[m].bench == bench));
+            let found: BTreeSet<usize> = found.map(|(_, bench)| *bench).collect();
+            let place = &truth.benches[bench as usize];
+            let message = format!("line {} bench {} lacks {count} modules", place.line, place.index);
+            wrongs.push(self.wrong(message, &found, &[bench].into(), true));
+        }
+        wrongs
+    }
+
+    /// Looks for a doubt that names one of the found benches, or a place on one of the true ones.
+    fn wrong(
+        &self,
+        message: String,
+        found: &BTreeSet<usize>,
+        true_benches: &BTreeSet<u32>,
+        about_missing: bool,
+    ) -> Wrong {
+        /// The frame of the reconstruction is shifted against the truth by about a metre.
+        const NEAR_M: f64 = 2.5;
+        let truth = &self.simulation.truth;
+        let on_bench = |place: &Vector2<f64>| {
+            let modules =
+                true_benches.iter().flat_map(|bench| &truth.modules[truth.benches[*bench as usize].modules.clone()]);
+            modules.into_iter().any(|module| (module.center_enu_m.xy() - place).norm() < NEAR_M)
+        };
+        let told = self.fused.doubts.iter().find(|doubt| {
+            (about_missing || doubt.code != "modules_not_seen")
+                && (doubt.benches.iter().any(|bench| found.contains(bench)) || doubt.places_m.iter().any(on_bench))
+        });
+        Wrong { message, told: told.map(|doubt| doubt.message.clone()) }
     }
 
     fn model(&self, previous: Option<&PlantModel>) -> PlantModel {
@@ -113,34 +179,34 @@ fn plant(kind: Option<LayoutKind>, seed: u64) -> PlantSpec {
     }
 }
 
-/// How many of the seeds come out exactly, and how many of the others are told of by no doubt.
+/// One thing that differs from the truth.
+struct Wrong {
+    message: String,
+    /// The doubt that names its place.
+    told: Option<String>,
+}
+
+/// How many of the seeds come out exactly, and in how many of the others something is wrong that no doubt names.
 fn survey(name: &str, seeds: u64, make: impl Fn(u64) -> Simulation + Sync) -> (usize, usize) {
-    let outcomes: Vec<(bool, bool, String)> = (0..seeds)
+    let outcomes: Vec<(u64, Vec<Wrong>, usize)> = (0..seeds)
         .into_par_iter()
         .map(|seed| {
             let mapped = Mapped::new(make(seed));
-            let report = mapped.report();
-            let exact = report.false_modules.is_empty()
-                && report.wrong_structure.is_empty()
-                && report.missing.len() <= mapped.never_seen();
-            let told = format!(
-                "{name} seed {seed}: {} missing ({} never seen), {} false, {} wrong ({:?}), {} doubts",
-                report.missing.len(),
-                mapped.never_seen(),
-                report.false_modules.len(),
-                report.wrong_structure.len(),
-                report.wrong_structure.first(),
-                mapped.fused.doubts.len(),
-            );
-            (exact, !exact && mapped.fused.doubts.is_empty(), told)
+            (seed, mapped.wrongs(), mapped.fused.doubts.len())
         })
         .collect();
-    for (_, _, told) in outcomes.iter().filter(|(exact, _, _)| !exact) {
-        println!("{told}");
+    for (seed, wrongs, doubts) in &outcomes {
+        for wrong in wrongs {
+            let told = wrong.told.as_deref().unwrap_or("UNTOLD");
+            println!("{name} seed {seed} ({doubts} doubts): {}; {told}", wrong.message);
+        }
     }
-    let exact = outcomes.iter().filter(|(exact, _, _)| *exact).count();
-    let silent = outcomes.iter().filter(|(_, silent, _)| *silent).count();
-    println!("{name}: {exact} of {seeds} exact, {silent} wrong without a doubt");
+    let exact = outcomes.iter().filter(|(_, wrongs, _)| wrongs.is_empty()).count();
+    let silent = outcomes.iter().filter(|(_, wrongs, _)| wrongs.iter().any(|wrong| wrong.told.is_none())).count();
+    let doubts: usize = outcomes.iter().filter(|(_, wrongs, _)| wrongs.is_empty()).map(|(_, _, doubts)| doubts).sum();
+    println!(
+        "{name}: {exact} of {seeds} exact, with {doubts} doubts in these; {silent} wrong where no doubt names the place"
+    );
     (exact, silent)
 }
 
