@@ -8,9 +8,11 @@ use heliomap::simulator::{Errors, Flight, PlantSpec, simulate};
 use rand::SeedableRng;
 use rand::rngs::StdRng;
 
+/// So many that the plant has about the 1.4 million points of the paper's cloud.
+const POINTS_PER_M2: f64 = 32.0;
+
 fn stages(criterion: &mut Criterion) {
     let spec = PlantSpec::paper_pp1(&mut StdRng::seed_from_u64(1));
-    // As many points as the paper's cloud has (4.1).
     let errors = Errors { cloud_points_per_m2: POINTS_PER_M2, ..Errors::paper() };
     let simulation = simulate(&spec, &Flight::paper_pp1(), &errors, 1);
     let detections: usize = simulation.detections.iter().map(|image| image.detections.len()).sum();

@@ -54,15 +54,25 @@ pub struct FusedBench {
     pub(super) cluster: usize,
 }
 
+/// What one view alone saw is left out where this many others look at the place and see the bench without it.
+const MANY: usize = 3;
+
 /// What the views say of one place in a bench.
 #[derive(Default)]
 struct Votes {
     observations: Vec<Observation>,
+    /// How many views detected it.
+    observed: usize,
+    /// Where one view alone detected it: the others that show the place, but have no module there nor expect one.
+    unseen: Vec<usize>,
     /// Views whose piece has the place as a hypothesis.
     inferred: BTreeSet<usize>,
     /// Views that show the place past the end of their piece, empty.
     absent: BTreeSet<usize>,
 }
+
+/// Votes by row and column.
+type Places = BTreeMap<(i32, i32), Votes>;
 
 /// Assembles the benches from their pieces.
 pub(super) fn assemble(
@@ -82,7 +92,7 @@ fn assemble_bench(
     doubts: &mut Vec<OpenDoubt>,
 ) -> Option<FusedBench> {
     let (members, margin) = (&clusters.members[cluster], clusters.margins[cluster]);
-    let mut votes: BTreeMap<(i32, i32), Votes> = BTreeMap::new();
+    let mut votes = Places::new();
     for &member in members {
         let (piece, place) = (&pieces[member], clusters.placements[member]);
         for cell in &piece.cells {
@@ -101,25 +111,33 @@ fn assemble_bench(
         }
     }
     let places: Vec<(i32, i32)> = votes.keys().copied().collect();
-    for extent in Extent::of_views(pieces, clusters, members) {
+    let extents = Extent::of_views(pieces, clusters, members);
+    for extent in &extents {
         for &(row, col) in &places {
             if extent.ends_before(row, col) && extent.shows(&views[extent.view], pieces, clusters, row, col) {
                 votes.entry((row, col)).or_default().absent.insert(extent.view);
             }
         }
     }
-    for entry in votes.values_mut() {
+    for ((row, col), entry) in &mut votes {
         // A view that shows the place in another of its pieces does not miss it.
         for observation in &entry.observations {
             entry.absent.remove(&observation.view);
             entry.inferred.remove(&observation.view);
         }
+        entry.observed = entry.observations.len();
+        if let [alone] = entry.observations[..] {
+            let others =
+                extents.iter().filter(|extent| extent.view != alone.view && !entry.inferred.contains(&extent.view));
+            let looking = others.filter(|extent| extent.shows(&views[extent.view], pieces, clusters, *row, *col));
+            entry.unseen = looking.map(|extent| extent.view).collect();
+        }
     }
     // Modules are those that were visually confirmed; past the ends that most views see, one detection is no proof.
-    let mut accepted: BTreeMap<(i32, i32), Votes> = votes
+    let (mut accepted, outvoted): (Places, Places) = votes
         .into_iter()
-        .filter(|(_, v)| !v.observations.is_empty() && v.observations.len() > v.absent.len() / 2)
-        .collect();
+        .filter(|(_, v)| !v.observations.is_empty())
+        .partition(|(_, v)| v.observed > v.absent.len() / 2 && v.unseen.len() < MANY);
     let seen_by: BTreeSet<usize> = accepted.values().flat_map(|v| v.observations.iter().map(|o| o.view)).collect();
     // Two boxes that one view alone saw beside each other are no bench.
     if accepted.len() < 2 || (accepted.len() < 4 && seen_by.len() < 2) {
@@ -169,6 +187,14 @@ fn assemble_bench(
         cluster,
     };
     doubts.extend(holes_to_check(views, &bench));
+    let kept = accepted.iter().filter(|(_, v)| v.observed <= v.absent.len() || v.unseen.len() > 1);
+    let left_out = outvoted.iter().filter(|(_, v)| v.observed > 1 || v.unseen.len() >= MANY);
+    let name = |(row, col): &(i32, i32)| (row - low_row + 1, col - low_col + 1);
+    let contested: Vec<Contested<'_>> = kept
+        .map(|(place, votes)| Contested { place: name(place), kept: true, votes })
+        .chain(left_out.map(|(place, votes)| Contested { place: name(place), kept: false, votes }))
+        .collect();
+    doubts.extend(places_to_check(views, &bench, &contested));
     Some(bench)
 }
 
@@ -225,7 +251,7 @@ impl Extent {
             || (row > self.rows.1 && self.closed[3])
     }
 
-    /// Whether a place past an end lies inside the image.
+    /// Whether a place lies inside the image.
     fn shows(&self, view: &View<'_>, pieces: &[LocatedPiece], clusters: &Clusters, row: i32, col: i32) -> bool {
         let own = |member: usize| {
             let place = clusters.placements[member];
@@ -236,8 +262,8 @@ impl Extent {
             (-c).max(c - piece.cols + 1).max(0) + (-r).max(r - piece.rows + 1).max(0)
         };
         let Some(&member) = self.members.iter().min_by_key(|member| distance(**member)) else { return false };
-        // Next to a piece it does: otherwise the end would be cut, and not closed.
-        if distance(member) <= 1 {
+        // Next to a piece's end it does: otherwise the end would be cut, and not closed.
+        if distance(member) <= 1 && self.ends_before(row, col) {
             return true;
         }
         let (piece, (r, c)) = (&pieces[member], own(member));
@@ -377,6 +403,49 @@ fn views_missing(views: &[View<'_>], bench: &FusedBench) -> usize {
             inside(&bench.middle_m) && 4 * places.iter().filter(|place| inside(place)).count() > 3 * places.len()
         })
         .count()
+}
+
+/// A place at which some views see a module and others do not.
+struct Contested<'a> {
+    /// Row and number, from 1.
+    place: (i32, i32),
+    kept: bool,
+    votes: &'a Votes,
+}
+
+/// Places where as many views look past the bench's end as saw a module, or more than one view looks and one alone saw a
+/// module, or where more than one saw a module and yet was outvoted.
+fn places_to_check(views: &[View<'_>], bench: &FusedBench, contested: &[Contested<'_>]) -> Option<OpenDoubt> {
+    let first = contested.first()?;
+    let shown: Vec<String> = contested
+        .iter()
+        .take(6)
+        .map(|Contested { place: (row, number), kept, votes }| {
+            let (seen, not) = (votes.observed, votes.absent.len().max(votes.unseen.len()));
+            let outcome = if *kept { "kept" } else { "left out" };
+            format!("row {row} number {number} is seen in {seen} and not in {not} images: {outcome}")
+        })
+        .collect();
+    let more = if contested.len() > 6 { format!("; and {} more places", contested.len() - 6) } else { String::new() };
+    let doubt = Doubt {
+        code: "modules_unsure",
+        message: format!(
+            "images disagree on the bench at {:.1} m east, {:.1} m north: {}{more}",
+            bench.middle_m.x,
+            bench.middle_m.y,
+            shown.join("; ")
+        ),
+        images: first
+            .votes
+            .absent
+            .iter()
+            .chain(&first.votes.unseen)
+            .map(|view| views[*view].shot.name.clone())
+            .collect(),
+        benches: Vec::new(),
+        places_m: vec![bench.middle_m.xy()],
+    };
+    Some(OpenDoubt { doubt, clusters: vec![bench.cluster] })
 }
 
 /// Places inside the bench where no view detected a module: said, not filled.

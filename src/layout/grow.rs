@@ -14,6 +14,8 @@ use std::collections::{BTreeMap, HashMap, VecDeque};
 const REACH: f64 = 1.45;
 /// Share of the shorter pitch that a module may stand off its lattice (the paper's RANSAC threshold).
 const INLIER: f64 = 0.25;
+/// So many modules in a row are a row by themselves, whatever stands about.
+const LONG: i32 = 12;
 
 /// A detection as the growth sees it: its centre, and the side vectors of its box, `b` a quarter turn clockwise from `a`.
 #[derive(Clone, Copy)]
@@ -592,8 +594,8 @@ fn bridge_is_sound(
     transition::looks_like_modules(grey, &places, &examples)
 }
 
-/// Turns every component so that its columns run along the row: a long one by its own shape, a short one as the nearest
-/// long one of the same kind. Columns then count to the right, rows downwards on the screen.
+/// Turns every component so that its columns run along the row: a long one by its own shape, a short one as the long ones
+/// about it and its shape say together. Columns then count to the right, rows downwards on the screen.
 fn orient(grown: &mut [Component], nodes: &[Node]) {
     let extent = |component: &Component| {
         let (cols, rows) = (component.col_range(), component.row_range());
@@ -622,11 +624,19 @@ fn orient(grown: &mut [Component], nodes: &[Node]) {
         let (cols, rows) = extent(component);
         let [u, v] = component.sides(nodes);
         let here = center(component);
-        let clear = f64::from(cols.max(rows)) >= 2.0 * f64::from(cols.min(rows)) && cols.max(rows) >= 4;
-        let along_u = if clear {
+        let clear = cols.max(rows) >= 2 * cols.min(rows) && cols.max(rows) >= 4;
+        let along_u = if clear && cols.max(rows) >= LONG {
             cols >= rows
         } else {
             let size = u.norm().max(v.norm());
+            // The frame may cut a bench down to its last columns: then its neighbours know better than its own shape,
+            // which is among them and halved here.
+            let own = match (clear, cols >= rows) {
+                (false, _) => 0.0,
+                (true, true) => 1.0,
+                (true, false) => -1.0,
+            };
+            let own = -0.5 * own * component.places.len() as f64 / 25.0;
             let vote: f64 = long
                 .iter()
                 .map(|(at, along, weight)| {
@@ -634,7 +644,8 @@ fn orient(grown: &mut [Component], nodes: &[Node]) {
                     let agreement = u.normalize().dot(along).abs() - v.normalize().dot(along).abs();
                     agreement * weight / (25.0 + distance * distance)
                 })
-                .sum();
+                .sum::<f64>()
+                + own;
             if vote.abs() > 1e-6 { vote > 0.0 } else { cols >= rows }
         };
         let along = if along_u { u } else { v };
