@@ -17,7 +17,7 @@ export ORT_DYLIB_PATH ?= $(abspath $(ORT_LIBRARY))
 HELIOMAP_DATA ?= $(wildcard ../shared/data)
 export HELIOMAP_DATA
 
-.PHONY: help setup web demo test lint unit client kills tus structure bench scaling yolo-export openapi clean
+.PHONY: help setup web demo test lint unit client kills tus contract query load structure bench scaling yolo-export openapi clean
 
 help: ## List the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -75,6 +75,24 @@ tus: setup .venv/tus/done tests/tus/node_modules/done ## Upload 1 GB by two tus 
 tests/tus/node_modules/done: tests/tus/package-lock.json
 	@cd tests/tus && $(NPM) ci --no-audit --no-fund --loglevel=error
 	@touch $@
+
+contract: setup .venv/contract/done ## Run schemathesis with all checks on openapi.yaml against a real service
+	$(CARGO) build --locked
+	.venv/contract/bin/python tests/contract/contract.py
+
+.venv/contract/done: tests/contract/requirements.txt
+	@$(PYTHON) -m venv .venv/contract && .venv/contract/bin/pip install --quiet --disable-pip-version-check --requirement $<
+	@touch $@
+
+query: setup ## How fast a dashboard is answered about a plant of a million modules, on SQLite and on Postgres
+	$(CARGO) build --release --locked
+	HELIOMAP_BINARY=target/release/heliomap $(PYTHON) tests/query/query.py
+	HELIOMAP_BINARY=target/release/heliomap tests/with-postgres.sh \
+	  bash -c '$(PYTHON) tests/query/query.py --database "$$HELIOMAP_TEST_POSTGRES/postgres"'
+
+load: setup ## 50 clients upload at once beside 200 dashboard requests per second: no error, quick answers, little memory
+	$(CARGO) build --release --locked
+	HELIOMAP_BINARY=target/release/heliomap $(PYTHON) tests/load/load.py
 
 structure: setup ## Survey of many simulated plants of every kind, on all cores; fails where too few come out exactly
 	$(CARGO) test --release --locked --no-fail-fast --test structure -- --ignored --nocapture --test-threads 1

@@ -12,7 +12,7 @@ use axum::response::{IntoResponse, Response};
     path = "/openapi.yaml",
     tag = "operation",
     security(()),
-    responses((status = 200, description = "OpenAPI 3.1", content_type = "application/yaml", body = String))
+    responses((status = 200, description = "OpenAPI 3.1", content_type = "application/yaml", body = serde_json::Value))
 )]
 pub async fn openapi_yaml() -> Result<Response, ApiError> {
     let text = openapi().to_yaml().map_err(|error| ApiError::internal(&error))?;

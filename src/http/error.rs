@@ -7,6 +7,7 @@ use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use serde_json::{Map, Value};
 use std::borrow::Cow;
+use utoipa::openapi::{OpenApi, RefOr, Schema};
 
 /// The media type of a problem document.
 pub const PROBLEM_JSON: &str = "application/problem+json";
@@ -198,6 +199,16 @@ pub struct Problem {
     pub code: String,
     /// What does not work and what to do, for people.
     pub detail: String,
+}
+
+/// Names every code in the description.
+pub fn describe(description: &mut OpenApi) {
+    let problem = description.components.as_mut().and_then(|components| components.schemas.get_mut("Problem"));
+    if let Some(RefOr::T(Schema::Object(problem))) = problem
+        && let Some(RefOr::T(Schema::Object(code))) = problem.properties.get_mut("code")
+    {
+        code.enum_values = Some(Code::ALL.iter().map(|code| code.parts().1.into()).collect());
+    }
 }
 
 /// The same document on every error, wherever it arose: what the framework answered with plain text becomes a problem.

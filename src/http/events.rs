@@ -18,6 +18,16 @@ const LOOK: Duration = Duration::from_millis(500);
 /// How often an idle line is kept open.
 const KEEP_ALIVE: Duration = Duration::from_secs(15);
 
+/// One of the events of a stream (`text/event-stream`).
+#[derive(utoipa::ToSchema)]
+#[expect(dead_code, reason = "it describes what is written as text")]
+struct JobEvent {
+    /// `job`
+    event: Option<String>,
+    /// The job as JSON, as `GET …/jobs/{job}` answers it.
+    data: String,
+}
+
 /// Follow a job
 ///
 /// An event `job` with the job as `GET …/jobs/{job}` answers it, now and whenever something of it has changed; the stream
@@ -32,7 +42,7 @@ const KEEP_ALIVE: Duration = Duration::from_secs(15);
         ("job" = Uuid, Path, description = "The job's identifier")
     ),
     responses(
-        (status = 200, description = "Events `job`, each with a job as data", content_type = "text/event-stream", body = String),
+        (status = 200, description = "Events `job`, each with a job as data", content_type = "text/event-stream", body = JobEvent),
         (status = 404, description = "`plant_not_found`, `job_not_found`", body = Problem,
             content_type = "application/problem+json")
     )

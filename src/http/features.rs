@@ -1,10 +1,10 @@
 //! What a model holds, as GeoJSON (RFC 7946).
 
-use super::AppState;
 use super::error::{ApiError, Code, Problem};
 use super::extract::{ApiPath, ApiQuery};
 use super::models::require_model;
 use super::paging::{next_link, parse_cursor};
+use super::{AppState, conditional};
 use crate::plant::{Layer, ModuleId, PlantId};
 use crate::store::{Feature, FeatureQuery, GeoBox, LayerInfo, Store};
 use axum::body::{Body, Bytes};
@@ -36,6 +36,7 @@ pub struct FeaturesQuery {
     #[param(minimum = 1, maximum = 10000)]
     pub limit: Option<u32>,
     /// Where to go on: taken from the link to the next part.
+    #[param(pattern = "^[0-9]{1,18}$")]
     pub cursor: Option<String>,
 }
 
@@ -108,8 +109,14 @@ pub async fn layer(
         .ok_or_else(|| ApiError::new(Code::NotFound, format!("the model has no layer {layer}")))?;
     let mut members: Map<String, Value> =
         serde_json::from_str(&info.properties).map_err(|error| ApiError::internal(&error))?;
+    // A model never changes, so that its version and what is asked of it tell what the answer is.
+    let tag = conditional::tag(format!("{} {layer} {query:?} {}", model.sha256, info.properties).as_bytes());
     let Some(limit) = limit else {
-        return Ok(([(header::CONTENT_TYPE, GEO_JSON)], whole(&state, info, members, within, after)).into_response());
+        return Ok((
+            [(header::CONTENT_TYPE, GEO_JSON.to_owned()), (header::ETAG, tag)],
+            whole(&state, info, members, within, after),
+        )
+            .into_response());
     };
     let mut features = state.store.features(&info, FeatureQuery { after, limit: limit + 1, within }).await?;
     let more = features.len() > limit as usize;
@@ -126,7 +133,7 @@ pub async fn layer(
     let mut body = opening(members);
     append(&mut body, &features, true);
     body.push_str("]}");
-    let mut response = ([(header::CONTENT_TYPE, GEO_JSON)], body).into_response();
+    let mut response = ([(header::CONTENT_TYPE, GEO_JSON.to_owned()), (header::ETAG, tag)], body).into_response();
     response.headers_mut().extend(next.as_deref().and_then(next_link));
     Ok(response)
 }

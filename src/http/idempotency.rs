@@ -281,6 +281,9 @@ pub fn describe(description: &mut OpenApi) {
             let Some(operation) = operation.as_mut().filter(|_| applies(&method, path)) else { continue };
             operation.parameters.get_or_insert_default().push(parameter.clone().into());
             let responses = &mut operation.responses.responses;
+            responses.entry("400".to_owned()).or_insert_with(|| {
+                problem("`bad_request`: the idempotency key is none; or another reason, as the code tells").into()
+            });
             responses.entry("409".to_owned()).or_insert_with(|| {
                 problem("`idempotency_busy`: the request is being answered; or another conflict, as the code tells")
                     .into()

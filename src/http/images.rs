@@ -13,8 +13,6 @@ use crate::store::{FileKind, FileRecord, SurveyId, SurveyPath};
 use axum::extract::State;
 use axum::http::header;
 use axum::response::{IntoResponse, Response};
-use base64::Engine;
-use base64::prelude::BASE64_URL_SAFE_NO_PAD;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
@@ -22,6 +20,8 @@ use std::collections::BTreeSet;
 
 /// Photos per look into the store.
 const CHUNK: u32 = 1000;
+/// Longest cursor: two digits for each byte of a path.
+const MAX_CURSOR: usize = 800;
 
 /// A file of a survey.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
@@ -185,6 +185,7 @@ pub struct ImagesQuery {
     #[param(minimum = 1, maximum = 1000, default = 100)]
     pub limit: Option<u32>,
     /// Where to go on: taken from the link to the next part.
+    #[param(pattern = "^([0-9a-f]{2})+$", max_length = 800)]
     pub cursor: Option<String>,
     /// Only photos with this warning: `blurred`, `underexposed`, `overexposed`, `no_position`, `no_time`, `duplicate`, or
     /// `any`.
@@ -195,14 +196,15 @@ pub struct ImagesQuery {
 }
 
 impl ImagesQuery {
-    fn after(&self) -> Result<Option<SurveyPath>, ApiError> {
-        let read = |cursor: &str| {
-            let path = String::from_utf8(BASE64_URL_SAFE_NO_PAD.decode(cursor).ok()?).ok()?;
-            SurveyPath::parse(&path).ok()
-        };
+    /// The path after which to go on: whatever its bytes are, only its place in the order counts.
+    fn after(&self) -> Result<String, ApiError> {
+        let Some(cursor) = &self.cursor else { return Ok(String::new()) };
+        let byte = |pair: &[u8]| u8::from_str_radix(std::str::from_utf8(pair).ok()?, 16).ok();
+        let bytes: Option<Vec<u8>> = cursor.as_bytes().chunks(2).map(byte).collect();
+        let well_formed = (2..=MAX_CURSOR).contains(&cursor.len()) && cursor.len() % 2 == 0;
+        let text = bytes.filter(|_| well_formed).map(|bytes| String::from_utf8_lossy(&bytes).replace('\0', ""));
         let wrong = "the cursor is none of this service's: take it from the link to the next part";
-        let found = self.cursor.as_deref().map(|cursor| read(cursor).ok_or(ApiError::new(Code::InvalidQuery, wrong)));
-        found.transpose()
+        text.ok_or(ApiError::new(Code::InvalidQuery, wrong))
     }
 
     fn check_warning(&self) -> Result<(), ApiError> {
@@ -222,7 +224,7 @@ impl ImagesQuery {
 
     /// The link to the part after a photo.
     fn next(&self, survey: &str, limit: u32, last: &str) -> String {
-        let cursor = BASE64_URL_SAFE_NO_PAD.encode(last);
+        let cursor: String = last.bytes().map(|byte| format!("{byte:02x}")).collect();
         let warning = self.warning.as_ref().map(|warning| format!("&warning={warning}")).unwrap_or_default();
         let reconstructed = self.reconstructed.map(|only| format!("&reconstructed={only}")).unwrap_or_default();
         format!("{survey}/images?limit={limit}&cursor={cursor}{warning}{reconstructed}")
@@ -248,7 +250,7 @@ impl<'a> Photos<'a> {
         Ok(Self { state, survey, shots })
     }
 
-    async fn part(&self, after: Option<&SurveyPath>, limit: u32) -> Result<Vec<ImageView>, ApiError> {
+    async fn part(&self, after: &str, limit: u32) -> Result<Vec<ImageView>, ApiError> {
         let mut images = Vec::new();
         for file in self.state.store.photos(self.survey, after, limit).await? {
             let twins = intake::twins(self.state, self.survey, &file).await?;
@@ -295,9 +297,9 @@ pub async fn list(
     let mut items: Vec<ImageView> = Vec::new();
     // One more than is shown tells whether there is a next part.
     while items.len() <= limit as usize {
-        let part = photos.part(after.as_ref(), CHUNK.min(limit + 1)).await?;
+        let part = photos.part(&after, CHUNK.min(limit + 1)).await?;
         let Some(last) = part.last() else { break };
-        after = Some(SurveyPath::parse(&last.file.path)?);
+        after.clone_from(&last.file.path);
         items.extend(part.into_iter().filter(|image| query.wants(image)));
     }
     let more = items.len() > limit as usize;
@@ -333,11 +335,11 @@ pub async fn positions(
     state.require_survey(plant, survey).await?;
     let photos = Photos::of(&state, survey).await?;
     let mut features = Vec::new();
-    let mut after = None;
+    let mut after = String::new();
     loop {
-        let part = photos.part(after.as_ref(), CHUNK).await?;
+        let part = photos.part(&after, CHUNK).await?;
         let Some(last) = part.last() else { break };
-        after = Some(SurveyPath::parse(&last.file.path)?);
+        after.clone_from(&last.file.path);
         features.extend(part.iter().filter_map(feature));
     }
     let body = json!({"type": "FeatureCollection", "survey": survey, "features": features}).to_string();

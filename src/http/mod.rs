@@ -5,6 +5,7 @@ pub mod router;
 pub mod state;
 
 mod admission;
+mod conditional;
 mod docs;
 mod events;
 mod extract;

@@ -2,8 +2,8 @@
 
 use super::guard::{Gate, Policy};
 use super::{
-    AppState, admission, docs, error, events, features, guard, health, idempotency, images, jobs, keys, models, page,
-    plants, surveys, tus, uploads,
+    AppState, admission, conditional, docs, error, events, features, guard, health, idempotency, images, jobs, keys,
+    models, page, plants, surveys, tus, uploads,
 };
 use crate::config::NetworkArgs;
 use crate::telemetry::Metrics;
@@ -16,6 +16,7 @@ use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
+use tower_http::CompressionLevel;
 use tower_http::catch_panic::CatchPanicLayer;
 use tower_http::compression::CompressionLayer;
 use tower_http::cors::CorsLayer;
@@ -96,8 +97,13 @@ fn uploads() -> OpenApiRouter<AppState> {
 pub fn openapi() -> utoipa::openapi::OpenApi {
     let mut description =
         OpenApiRouter::with_openapi(Description::openapi()).merge(prompt()).merge(uploads()).into_openapi();
+    // What a wildcard matches is a parameter like any other.
+    let paths = std::mem::take(&mut description.paths.paths);
+    description.paths.paths = paths.into_iter().map(|(path, item)| (path.replace("{*", "{"), item)).collect();
     guard::describe(&mut description);
     idempotency::describe(&mut description);
+    conditional::describe(&mut description);
+    error::describe(&mut description);
     description
 }
 
@@ -111,6 +117,7 @@ pub fn router(state: AppState) -> Router {
     let (metrics, cors) = (state.metrics.clone(), cors(&state.network));
     let gate = Gate { state: state.clone(), policy: Arc::new(Policy::of(&description)) };
     router
+        .route_layer(middleware::from_fn(conditional::conditional))
         .route_layer(middleware::from_fn_with_state(state.clone(), idempotency::once))
         .route_layer(middleware::from_fn_with_state(gate, guard::guard))
         .route_layer(middleware::from_fn_with_state(metrics, count))
@@ -120,7 +127,8 @@ pub fn router(state: AppState) -> Router {
         // The innermost first.
         .layer(CatchPanicLayer::custom(panicked))
         .layer(middleware::map_response(error::only_problems))
-        .layer(CompressionLayer::new())
+        // A plant is megabytes of JSON, which little effort makes small.
+        .layer(CompressionLayer::new().quality(CompressionLevel::Fastest))
         .layer(tower::util::option_layer(cors))
         .layer(PropagateRequestIdLayer::new(REQUEST_ID))
         .layer(TraceLayer::new_for_http().make_span_with(span).on_response(log_response).on_failure(()))

@@ -238,10 +238,14 @@ async fn require_upload(state: &AppState, survey: SurveyId, id: UploadId) -> Res
         ("plant" = Uuid, Path, description = "The plant's identifier"),
         ("survey" = Uuid, Path, description = "The survey's identifier")
     ),
-    responses((status = 204, description = "See the headers", headers(("tus-version" = String), ("tus-extension" = String),
-        ("tus-max-size" = u64), ("tus-checksum-algorithm" = String))))
+    responses(
+        (status = 204, description = "See the headers", headers(("tus-version" = String), ("tus-extension" = String),
+            ("tus-max-size" = u64), ("tus-checksum-algorithm" = String))),
+        (status = 404, description = "`not_found`: identifiers are UUIDs", body = Problem,
+            content_type = "application/problem+json")
+    )
 )]
-pub async fn options(State(state): State<AppState>) -> Response {
+pub async fn options(State(state): State<AppState>, _place: ApiPath<(PlantId, SurveyId)>) -> Response {
     let largest = state.limits.max_archive_size.max(state.limits.max_file_size).to_string();
     let headers = [
         ("tus-version", VERSION),
@@ -265,7 +269,7 @@ pub async fn options(State(state): State<AppState>) -> Response {
     params(
         ("plant" = Uuid, Path, description = "The plant's identifier"),
         ("survey" = Uuid, Path, description = "The survey's identifier"),
-        ("tus-resumable" = String, Header, description = "`1.0.0`"),
+        ("tus-resumable" = String, Header, pattern = "^1\\.0\\.0$", description = "`1.0.0`"),
         ("upload-length" = Option<u64>, Header, description = "Bytes of the file"),
         ("upload-metadata" = Option<String>, Header, description = "Names, each with its value in base64"),
         ("upload-concat" = Option<String>, Header, description = "`partial`, or `final;` and the parts")
@@ -388,7 +392,7 @@ async fn finished_parts(state: &AppState, survey: SurveyId, urls: &str) -> Resul
         ("plant" = Uuid, Path, description = "The plant's identifier"),
         ("survey" = Uuid, Path, description = "The survey's identifier"),
         ("upload" = Uuid, Path, description = "The upload's identifier"),
-        ("tus-resumable" = String, Header, description = "`1.0.0`")
+        ("tus-resumable" = String, Header, pattern = "^1\\.0\\.0$", description = "`1.0.0`")
     ),
     responses(
         (status = 200, description = "Go on at `upload-offset`", headers(("upload-offset" = u64), ("upload-length" = u64),
@@ -482,7 +486,7 @@ pub async fn get(
         ("plant" = Uuid, Path, description = "The plant's identifier"),
         ("survey" = Uuid, Path, description = "The survey's identifier"),
         ("upload" = Uuid, Path, description = "The upload's identifier"),
-        ("tus-resumable" = String, Header, description = "`1.0.0`"),
+        ("tus-resumable" = String, Header, pattern = "^1\\.0\\.0$", description = "`1.0.0`"),
         ("upload-offset" = u64, Header, description = "Where these bytes begin"),
         ("upload-checksum" = Option<String>, Header, description = "Algorithm and digest in base64")
     ),
@@ -660,7 +664,7 @@ async fn store_whole(state: &AppState, plant: PlantId, upload: &Upload) -> Resul
         ("plant" = Uuid, Path, description = "The plant's identifier"),
         ("survey" = Uuid, Path, description = "The survey's identifier"),
         ("upload" = Uuid, Path, description = "The upload's identifier"),
-        ("tus-resumable" = String, Header, description = "`1.0.0`")
+        ("tus-resumable" = String, Header, pattern = "^1\\.0\\.0$", description = "`1.0.0`")
     ),
     responses(
         (status = 204, description = "Gone; a file that was stored stays"),
@@ -702,7 +706,7 @@ async fn end(
         ("plant" = Uuid, Path, description = "The plant's identifier"),
         ("survey" = Uuid, Path, description = "The survey's identifier"),
         ("upload" = Uuid, Path, description = "The upload's identifier"),
-        ("x-http-method-override" = String, Header, description = "`PATCH` or `DELETE`")
+        ("x-http-method-override" = String, Header, pattern = "^(PATCH|DELETE)$", description = "`PATCH` or `DELETE`")
     ),
     request_body(content = Vec<u8>, content_type = "application/offset+octet-stream", description = "The bytes"),
     responses(

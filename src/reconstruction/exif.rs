@@ -34,8 +34,13 @@ pub struct Position {
 
 /// Reads a photo's EXIF; a photo without any, or with what cannot be read, tells nothing.
 pub fn read(path: &Path) -> Exposure {
-    let exif = File::open(path).ok().and_then(|file| Reader::new().read_from_container(&mut BufReader::new(file)).ok());
-    let Some(exif) = exif else { return Exposure::default() };
+    let Ok(file) = File::open(path) else { return Exposure::default() };
+    // Cameras and programs that copy files write directories that are not to the letter: what can be read of them counts.
+    let exif = Reader::new()
+        .continue_on_error(true)
+        .read_from_container(&mut BufReader::new(file))
+        .or_else(|error| error.distill_partial_result(|_| {}));
+    let Ok(exif) = exif else { return Exposure::default() };
     Exposure { camera: camera(&exif), taken: taken(&exif), position: position(&exif) }
 }
 

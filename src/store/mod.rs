@@ -115,13 +115,8 @@ pub trait Store: AccessStore + UploadStore + RequestStore {
 
     /// One file of a survey.
     async fn file(&self, survey: SurveyId, path: &SurveyPath) -> Result<Option<FileRecord>, StoreError>;
-    /// A survey's photos sorted by path: at most `limit` after the one at a path.
-    async fn photos(
-        &self,
-        survey: SurveyId,
-        after: Option<&SurveyPath>,
-        limit: u32,
-    ) -> Result<Vec<FileRecord>, StoreError>;
+    /// A survey's photos sorted by path: at most `limit` of those after a text.
+    async fn photos(&self, survey: SurveyId, after: &str, limit: u32) -> Result<Vec<FileRecord>, StoreError>;
     /// Where a survey's photos with these bytes are, sorted, at most `limit`.
     async fn photos_of_digest(
         &self,

@@ -20,8 +20,10 @@ EDGE_PX = 3.0
 class Service:
     """A service on a free port of loopback and an empty data folder, with the secret of an administrator's key."""
 
-    def __init__(self, data: Path, *arguments: str):
+    def __init__(self, data: Path, *arguments: str, database: str | None = None):
         self.environment = {**os.environ, "HELIOMAP_DATA_DIR": str(data), "HELIOMAP_LOG": "warn"}
+        if database:
+            self.environment["HELIOMAP_DATABASE"] = database
         create = [str(BINARY), "keys", "create", "--name", "test", "--scope", "admin"]
         self.key = subprocess.run(create, env=self.environment, check=True, capture_output=True, text=True).stdout.strip()
         self.arguments = arguments
@@ -42,6 +44,11 @@ class Service:
         self.process.kill()
         self.process.wait()
         self.process.stdout.close()
+
+    def again(self) -> Service:
+        """Starts it after it has ended."""
+        self.start()
+        return self
 
     def __enter__(self) -> Service:
         return self

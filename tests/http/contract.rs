@@ -2,6 +2,7 @@
 
 use crate::app::{Act, App, plant_path};
 use heliomap::http::openapi;
+use reqwest::{Method, StatusCode};
 use serde_json::{Value, json};
 
 /// To accept a change: `cargo run -- openapi > openapi.yaml`.
@@ -65,4 +66,36 @@ async fn the_service_describes_itself() {
     assert!(yaml.as_str().unwrap().starts_with("openapi: 3.1"));
     let (_, document) = app.get("/openapi.json").await;
     assert!(document["paths"]["/api/v1/plants"]["post"].is_object());
+}
+
+#[tokio::test]
+async fn what_a_client_has_is_not_sent_again() {
+    let app = App::new(&[Act::Map(2)]).await;
+    let survey = app.complete_survey().await;
+    app.map(&survey).await;
+    let plant = plant_path(&survey);
+    let mut tags = Vec::new();
+    for path in [
+        plant.to_owned(),
+        survey.clone(),
+        format!("{survey}/images"),
+        format!("{plant}/models/latest/modules"),
+        format!("{plant}/models/1/modules?limit=1"),
+        format!("{plant}/models/1/lines"),
+    ] {
+        let answer = app.request(Method::GET, &path).send().await.unwrap();
+        let tag = answer.headers()["etag"].clone();
+        let known = format!("\"other\", {}", tag.to_str().unwrap());
+        let again = app.request(Method::GET, &path).header("if-none-match", known).send().await.unwrap();
+        assert_eq!((again.status(), &again.headers()["etag"]), (StatusCode::NOT_MODIFIED, &tag), "{path}");
+        assert!(again.bytes().await.unwrap().is_empty());
+        let other = app.request(Method::GET, &path).header("if-none-match", "\"other\"").send().await.unwrap();
+        assert_eq!(other.status(), StatusCode::OK);
+        tags.push(tag);
+    }
+    // `latest` is 1, whole and in part are two things.
+    assert_eq!(tags.iter().collect::<std::collections::BTreeSet<_>>().len(), tags.len());
+    app.put(&format!("{survey}/images/c.jpg"), crate::app::jpeg(8, 8)).await;
+    let changed = app.request(Method::GET, &survey).header("if-none-match", tags[1].clone()).send().await.unwrap();
+    assert_eq!(changed.status(), StatusCode::OK);
 }
