@@ -120,7 +120,7 @@ export class Surveys {
         ...(left > 0 ? [h("p", {}, `${plural(left, "photo is", "photos are")} not in the reconstruction.`)] : []),
         h(
           "ul",
-          { class: "images" },
+          { class: "images warned" },
           ...warned.map(({ name, warnings = [] }) =>
             h("li", {}, h("strong", {}, name), ` ${warnings.map(({ message }) => message).join("; ")}`),
           ),
