@@ -37,11 +37,11 @@ pub(super) fn detect(
     if width == 0 || height == 0 {
         return Ok(Vec::new());
     }
-    let mut boxes = search(unet, yolo, image, gsd_m)?;
+    let mut boxes = search(unet, yolo, image, gsd_m, gsd_m)?;
     let is_enlarged = unet.is_some_and(|unet| unet.enlarges(gsd_m)) || yolo.is_some_and(|yolo| yolo.enlarges(gsd_m));
     if is_enlarged {
         // Enlarging a coarse photo helps where seams are faint, and harms where they are blurred.
-        let as_taken = search(unet, yolo, image, None)?;
+        let as_taken = search(unet, yolo, image, None, gsd_m)?;
         if area_in_lattices_px2(&as_taken) > area_in_lattices_px2(&boxes) {
             boxes = as_taken;
         }
@@ -50,21 +50,23 @@ pub(super) fn detect(
     Ok(boxes.iter().filter_map(detection).filter(|d| filter::is_inside_frame(&d.quad.corners, width, height)).collect())
 }
 
-/// The boxes of an image that is taken to have a ground sampling distance; those that the frame cuts are among them.
+/// The boxes of an image whose networks see it as if it had the ground sampling distance `working_gsd_m`; those that the
+/// frame cuts are among them.
 fn search(
     unet: Option<&Unet>,
     yolo: Option<&Yolo>,
     image: &RgbImage,
+    working_gsd_m: Option<f64>,
     gsd_m: Option<f64>,
 ) -> Result<Vec<ModuleBox>, DetectionError> {
     let (foundation, seen) = match unet {
         Some(unet) => {
-            let (boxes, seen) = unet.search(image, gsd_m)?;
+            let (boxes, seen) = unet.search(image, working_gsd_m)?;
             (boxes, Some(seen))
         }
         None => (Vec::new(), None),
     };
-    let complement = yolo.map(|yolo| yolo.search(image, gsd_m)).transpose()?.unwrap_or_default();
+    let complement = yolo.map(|yolo| yolo.search(image, working_gsd_m)).transpose()?.unwrap_or_default();
     let evidence = seen.as_ref().map(|seen| seen as &dyn lattice::Evidence);
     let size = Vector2::new(f64::from(image.width()), f64::from(image.height()));
     // Each network's boxes in their own lattices first: the less exact must not disturb the more exact.
@@ -73,7 +75,7 @@ fn search(
     let shows = |b: &ModuleBox| evidence.is_none_or(|evidence| lattice::face(b, evidence) > TRACE);
     let boxes = filter::supported(merge(foundation, complement, shows));
     Ok(match &seen {
-        Some(seen) => periodicity::part_benches(boxes, &seen.view(image)),
+        Some(seen) => periodicity::part_benches(boxes, &seen.view(image, gsd_m)),
         None => boxes,
     })
 }

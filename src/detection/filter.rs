@@ -14,6 +14,9 @@ pub(super) const SIZE: (f64, f64) = (0.45, 2.0);
 pub(super) const OVERLAP: f64 = 0.2;
 /// Score from which a box needs no neighbour.
 const ALONE: f32 = 0.9;
+/// The most boxes of a group that may be dropped, and by how much its median score falls short of the image's.
+const SMALL: usize = 8;
+const WEAKER: f64 = 0.2;
 /// Tolerance of a neighbour's place, in modules.
 const LATTICE: f64 = 0.2;
 /// Difference of the logarithm of a box's area to the usual there, from which it is odd.
@@ -37,10 +40,47 @@ pub fn plausible(boxes: Vec<ModuleBox>, module: &ProbabilityMap) -> Vec<ModuleBo
     without_overlaps(mend_odd_ones(sized))
 }
 
-/// Without the weak boxes that stand alone: a good one needs no neighbour.
+/// Without the weak boxes that stand alone, for a good one needs no neighbour, and without small groups far weaker than what
+/// the image shows elsewhere: light through the seams of shadows, planks, bushes in a row.
 pub fn supported(boxes: Vec<ModuleBox>) -> Vec<ModuleBox> {
     let neighbours = lattice_neighbours(&boxes);
-    boxes.into_iter().zip(neighbours).filter(|(b, near)| !near.is_empty() || b.score > ALONE).map(|(b, _)| b).collect()
+    let usual = middle(boxes.iter().map(|b| f64::from(b.score)));
+    let mut is_kept: Vec<bool> =
+        boxes.iter().zip(&neighbours).map(|(b, near)| !near.is_empty() || b.score > ALONE).collect();
+    for group in groups(&neighbours) {
+        let score = middle(group.iter().map(|&index| f64::from(boxes[index].score)));
+        if group.len() <= SMALL && score < usual - WEAKER {
+            group.into_iter().for_each(|index| is_kept[index] = false);
+        }
+    }
+    boxes.into_iter().zip(is_kept).filter(|(_, kept)| *kept).map(|(b, _)| b).collect()
+}
+
+/// Boxes that reach each other from neighbour to neighbour.
+fn groups(neighbours: &[Vec<usize>]) -> Vec<Vec<usize>> {
+    let mut linked: Vec<Vec<usize>> = neighbours.to_vec();
+    for (index, near) in neighbours.iter().enumerate() {
+        near.iter().for_each(|&other| linked[other].push(index));
+    }
+    let mut is_seen = vec![false; neighbours.len()];
+    let mut found = Vec::new();
+    for start in 0..neighbours.len() {
+        if std::mem::replace(&mut is_seen[start], true) {
+            continue;
+        }
+        let mut group = vec![start];
+        let mut next = 0;
+        while next < group.len() {
+            for &other in &linked[group[next]] {
+                if !std::mem::replace(&mut is_seen[other], true) {
+                    group.push(other);
+                }
+            }
+            next += 1;
+        }
+        found.push(group);
+    }
+    found
 }
 
 /// An odd box that stands in the lattice of others takes their shape; one that does not is dropped.
@@ -273,5 +313,23 @@ mod tests {
         assert!(!inside(9.4, 4.5));
         assert!(inside(89.5, 44.5));
         assert!(!inside(89.5, 44.6));
+    }
+
+    #[test]
+    fn a_small_group_far_weaker_than_the_rest_is_dropped() {
+        let at = |x: f64, y: f64, score: f32| ModuleBox {
+            center: Vector2::new(x, y),
+            u: Vector2::new(0.0, 32.0),
+            v: Vector2::new(20.0, 0.0),
+            score,
+            source: Source::Unet,
+        };
+        let bench: Vec<ModuleBox> = (0..12).map(|k| at(50.0 + 20.6 * f64::from(k), 50.0, 0.98)).collect();
+        let group = |score: f32| (0..4).map(move |k| at(60.0 + 20.6 * f64::from(k), 400.0, score));
+        let count = |score: f32| supported(bench.iter().copied().chain(group(score)).collect()).len();
+        assert_eq!(count(0.65), 12);
+        assert_eq!(count(0.9), 16);
+        // In a photo that is hard throughout, weak boxes are all there is.
+        assert_eq!(supported(group(0.65).collect()).len(), 4);
     }
 }

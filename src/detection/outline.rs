@@ -7,7 +7,7 @@ use super::mask_to_boxes::Run;
 use super::probability::ProbabilityMap;
 use imageproc::geometry::min_area_rect;
 use imageproc::point::Point;
-use nalgebra::{Matrix2, Vector2};
+use nalgebra::{Matrix2, Rotation2, Vector2};
 
 /// A pixel belongs to a bench above this probability.
 pub(super) const FACE: f32 = 0.5;
@@ -79,6 +79,19 @@ impl Outline {
             corners.rotate_left(2);
         }
         Some(Self { corners, is_whole })
+    }
+}
+
+impl Outline {
+    /// With the second end turned by an angle about its middle, the long sides as they are.
+    pub fn turned(&self, angle_rad: f64) -> Option<Self> {
+        if angle_rad == 0.0 {
+            return Some(self.clone());
+        }
+        let [a, b, c, d] = self.corners;
+        let through = |point: Vector2<f64>, to: Vector2<f64>| Line { point, direction: (to - point).normalize() };
+        let end = Line { point: (b + c) / 2.0, direction: Rotation2::new(angle_rad) * (c - b).normalize() };
+        Some(Self { corners: [a, through(a, b).crossing(&end)?, through(d, c).crossing(&end)?, d], ..*self })
     }
 }
 

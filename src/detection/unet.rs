@@ -56,8 +56,8 @@ impl Seen {
 
 impl Seen {
     /// The image beside what was said of it.
-    pub(super) fn view<'a>(&'a self, image: &'a RgbImage) -> View<'a> {
-        View { image, module: &self.masks.module, core: self.masks.core.as_ref(), pixel: self.pixel }
+    pub(super) fn view<'a>(&'a self, image: &'a RgbImage, gsd_m: Option<f64>) -> View<'a> {
+        View { image, module: &self.masks.module, core: self.masks.core.as_ref(), pixel: self.pixel, gsd_m }
     }
 }
 
