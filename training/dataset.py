@@ -15,7 +15,7 @@ from .sources import Photo
 from .targets import make_targets
 
 SHORT_SIDE = (9.0, 44.0)  # short side of a module in pixels
-HARDNESS = {"halfcut": 2.5, "poly": 1.5}  # how often photos of a style are taken, others once
+HARDNESS = {"halfcut": 2.5, "poly": 2.5}  # how often photos of a style are taken, others once
 
 
 def dihedral(image: np.ndarray, quads: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:

@@ -35,10 +35,13 @@ const COARSE_PX: usize = 15;
 const END_PX: i32 = 6;
 const END_STEP_PX: f64 = 0.5;
 /// Step between periods where one end is open: by so many pixels the last module moves.
-const OPEN_STEP_PX: f64 = 0.7;
+const OPEN_STEP_PX: f64 = 1.0;
 /// How far, in which steps, the end that the frame cuts off is turned against the other.
 const TURN_RAD: f64 = 0.02;
 const MOST_TURNS: i32 = 3;
+/// The best periods that are tried at each turn, and the steps that they may change by.
+const NEAR_PERIODS: usize = 4;
+const NEAR_STEPS: i32 = 6;
 /// The best periods of an axis, and the best pairs of both axes, that are weighed.
 const MOST_PERIODS: usize = 40;
 const MOST_PATTERNS: usize = 400;
@@ -194,16 +197,7 @@ fn decided(benches: &[Bench], sides: Vector2<f64>) -> Vec<(&Bench, Pattern)> {
 
 impl Bench {
     fn of(outline: Outline, area_px2: f64, view: &View) -> Option<Self> {
-        // Perspective turns the columns from the end that is seen to the one that is not.
-        let turns = if outline.is_whole { 0..=0 } else { -MOST_TURNS..=MOST_TURNS };
-        let tried = turns.filter_map(|turn| {
-            let outline = outline.turned(f64::from(turn) * TURN_RAD)?;
-            let raster = Raster::of(&outline, view)?;
-            let along = raster.profile(true).periods(outline.is_whole);
-            let explained = along.first()?.explained;
-            Some((outline, raster, along, explained))
-        });
-        let (outline, raster, along, _) = tried.max_by(|a, b| a.3.total_cmp(&b.3))?;
+        let (outline, raster, along) = Self::straightened(outline, view)?;
         let across = raster.profile(false).periods(true);
         let mut patterns = Vec::new();
         for &along in &along {
@@ -222,6 +216,30 @@ impl Bench {
         patterns.sort_by(|a, b| b.score.total_cmp(&a.score));
         patterns.truncate(MOST_PATTERNS);
         Some(Self { outline, raster, area_px2, patterns })
+    }
+
+    /// The outline with its cut end turned so that the columns repeat best, for perspective turns them from the end that is
+    /// seen to the one that is not; its raster, and its periods along.
+    fn straightened(outline: Outline, view: &View) -> Option<(Outline, Raster, Vec<Period>)> {
+        let raster = Raster::of(&outline, view)?;
+        let periods = raster.profile(true).periods(outline.is_whole);
+        let best = periods.first()?.explained;
+        if outline.is_whole {
+            return Some((outline, raster, periods));
+        }
+        let turned = (-MOST_TURNS..=MOST_TURNS).filter(|turn| *turn != 0).filter_map(|turn| {
+            let outline = outline.turned(f64::from(turn) * TURN_RAD)?;
+            let raster = Raster::of(&outline, view)?;
+            let explained = raster.profile(true).explained_near(&periods);
+            Some((outline, raster, explained))
+        });
+        match turned.max_by(|a, b| a.2.total_cmp(&b.2)) {
+            Some((outline, raster, explained)) if explained > best => {
+                let periods = raster.profile(true).periods(false);
+                Some((outline, raster, periods))
+            }
+            _ => Some((outline, raster, periods)),
+        }
     }
 
     /// The best pattern of modules with these sides, but for `tolerance`, where it leads by `lead`.
@@ -389,6 +407,14 @@ impl Profile {
         };
         let left = self.channels.iter().map(share).sum::<f64>() / self.channels.len() as f64;
         1.0 - left * (places.len() - 1) as f64 / (places.len() - freedom) as f64
+    }
+
+    /// The most that a period close to one of the best of `periods` explains.
+    fn explained_near(&self, periods: &[Period]) -> f64 {
+        let step = OPEN_STEP_PX / self.length();
+        let near = |px: f64| (-NEAR_STEPS..=NEAR_STEPS).map(move |k| px * (f64::from(k) * step).exp());
+        let tried = periods.iter().take(NEAR_PERIODS).flat_map(|period| near(period.px));
+        tried.map(|px| self.explained(px, |x| x / px)).fold(f64::NEG_INFINITY, f64::max)
     }
 
     /// The periods that explain most, best first. Where the axis is whole, it holds a whole number of modules.

@@ -30,7 +30,12 @@ pub fn from_metadata(path: &Path, width: u32, height: u32) -> Option<f64> {
     let mut start = Vec::new();
     File::open(path).ok()?.take(METADATA_BYTES).read_to_end(&mut start).ok()?;
     let height_m = relative_altitude_m(&start)?;
-    let exif = Reader::new().read_from_container(&mut BufReader::new(File::open(path).ok()?)).ok()?;
+    // What can be read counts, where a directory is not to the letter.
+    let exif = Reader::new()
+        .continue_on_error(true)
+        .read_from_container(&mut BufReader::new(File::open(path).ok()?))
+        .or_else(|error| error.distill_partial_result(|_| {}))
+        .ok()?;
     let focal_mm = f64::from(exif.get_field(Tag::FocalLengthIn35mmFilm, In::PRIMARY)?.value.get_uint(0)?);
     let focal_px = focal_mm / FILM_DIAGONAL_MM * f64::from(width).hypot(f64::from(height));
     (HEIGHTS_M.contains(&height_m) && focal_px > 1.0).then(|| height_m / focal_px)
