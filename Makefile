@@ -54,7 +54,7 @@ unit: setup ## Tests alone
 
 client: setup ## The Python client and every command of docs/API.md against the real service
 	@command -v jq >/dev/null || { apt-get update -qq && apt-get install -qq --yes --no-install-recommends jq >/dev/null; }
-	$(CARGO) build --locked
+	$(CARGO) test --locked --no-run
 	$(PYTHON) -m unittest discover --start-directory tests/clients
 
 KILLS ?= 200
