@@ -16,7 +16,7 @@ as_user=()
 if [ "$(id -u)" = 0 ]; then
     as_user=(setpriv --reuid=postgres --regid=postgres --clear-groups)
 fi
-folder=$(mktemp -d /tmp/heliomap-postgres-XXXXXX)
+folder=$(mktemp -d -t heliomap-postgres-XXXXXX)
 [ "$(id -u)" = 0 ] && chown postgres "$folder"
 port=$(python3 -c 'import socket; s = socket.socket(); s.bind(("127.0.0.1", 0)); print(s.getsockname()[1])')
 finish() {

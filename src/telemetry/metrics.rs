@@ -69,8 +69,6 @@ pub struct Metrics {
     /// Attempts at jobs, by how they ended.
     pub attempts: Family<OutcomeLabels, Counter>,
     pub stage_seconds: Family<StageLabels, Histogram, fn() -> Histogram>,
-    /// Deliveries to webhooks, by how they ended.
-    pub deliveries: Family<OutcomeLabels, Counter>,
     jobs: Family<StateLabels, Gauge>,
     queue_depth: Gauge,
     queue_age_seconds: Seconds,
@@ -90,7 +88,6 @@ impl Default for Metrics {
             upload_bytes: Counter::default(),
             attempts: Family::default(),
             stage_seconds: Family::new_with_constructor(works),
-            deliveries: Family::default(),
             jobs: Family::default(),
             queue_depth: Gauge::default(),
             queue_age_seconds: Gauge::default(),
@@ -115,7 +112,6 @@ impl Default for Metrics {
             Unit::Seconds,
             metrics.stage_seconds.clone(),
         );
-        registry.register("webhook_deliveries", "Deliveries to webhooks by how they ended", metrics.deliveries.clone());
         registry.register("jobs", "Jobs by state, whoever's and whichever process's", metrics.jobs.clone());
         registry.register("queue_depth", "Jobs that wait for a worker", metrics.queue_depth.clone());
         registry.register_with_unit(

@@ -68,6 +68,20 @@ def lay_out_example(folder: Path) -> None:
     (folder / "boxes.json").write_text(json.dumps(true_boxes()))
 
 
+def map_example(client, folder: Path, name: str) -> tuple[str, str, dict]:
+    """Lays out the example in a folder, uploads it to a new plant of that name and maps it: plant, survey, the job's end.
+
+    `client` is a `heliomap_client.Client`.
+    """
+    lay_out_example(folder)
+    plant = client.create_plant(name)["id"]
+    survey = client.create_survey(plant, "June")["id"]
+    client.upload_folder(plant, survey, folder)
+    job = client.follow(plant, client.start_job(plant, survey)["id"])
+    assert job["state"] == "succeeded", job
+    return plant, survey, job
+
+
 def true_boxes() -> dict:
     """The modules in the undistorted photos that resolve them, from the true cameras: as tests/common/boxes.rs."""
     truth = json.loads((EXAMPLE / "truth.json").read_text())

@@ -15,7 +15,7 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent.parent
 sys.path += [str(ROOT / "tests" / "clients"), str(ROOT / "clients" / "python")]
 from heliomap_client import Client  # noqa: E402
-from service import Service, lay_out_example  # noqa: E402
+from service import Service, map_example  # noqa: E402
 
 
 def main() -> int:
@@ -25,13 +25,7 @@ def main() -> int:
     args = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="heliomap-contract-") as name, Service(Path(name) / "data") as service:
         client = Client(service.url, service.key)
-        survey_folder = Path(name) / "survey"
-        lay_out_example(survey_folder)
-        plant = client.create_plant("Contract")["id"]
-        survey = client.create_survey(plant, "June")["id"]
-        client.upload_folder(plant, survey, survey_folder)
-        job = client.follow(plant, client.start_job(plant, survey)["id"])
-        assert job["state"] == "succeeded", job
+        plant, survey, job = map_example(client, Path(name) / "survey", "Contract")
         features = client.call("GET", f"/api/v1/plants/{plant}/models/latest/modules?limit=1")["features"]
         environment = {
             **os.environ,

@@ -20,7 +20,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent.parent
 sys.path += [str(ROOT / "tests" / "clients"), str(ROOT / "clients" / "python")]
 from heliomap_client import Client  # noqa: E402
-from service import EXAMPLE, Service, lay_out_example  # noqa: E402
+from service import EXAMPLE, Service, map_example  # noqa: E402
 
 DASHBOARD_P99_MS = 100.0
 SERVER_MEMORY_BYTES = 1 << 30
@@ -101,13 +101,7 @@ def main() -> int:
     args = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="heliomap-load-") as name, Service(Path(name) / "data") as service:
         client = Client(service.url, service.key)
-        folder = Path(name) / "survey"
-        lay_out_example(folder)
-        plant = client.create_plant("Load")["id"]
-        survey = client.create_survey(plant, "June")["id"]
-        client.upload_folder(plant, survey, folder)
-        job = client.follow(plant, client.start_job(plant, survey)["id"])
-        assert job["state"] == "succeeded", job
+        plant, _, job = map_example(client, Path(name) / "survey", "Load")
         here = f"/api/v1/plants/{plant}"
         model = f"{here}/models/latest"
         modules = [one["id"] for one in client.call("GET", f"{model}/modules?limit=50")["features"]]

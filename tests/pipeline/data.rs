@@ -50,9 +50,9 @@ fn a_real_plant_is_mapped_to_its_end_with_most_whole_benches_right() {
     for module in modules["features"].as_array().unwrap() {
         *benches.entry(module["properties"]["bench"].as_str().unwrap()).or_default() += 1;
     }
-    // Ten benches of 54 columns and 3 rows were counted; half of them is the least that must come out.
+    // Ten benches of 54 columns and 3 rows were counted on an orthophoto; one of them still lacks a column.
     let whole = benches.values().filter(|count| **count == 162).count();
-    assert!(whole >= 5, "{whole} benches of 162 modules: {benches:?}");
+    assert!(whole >= 9, "{whole} benches of 162 modules: {benches:?}");
 }
 
 /// Image files anywhere in a folder, every so many of them.
