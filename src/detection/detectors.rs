@@ -89,3 +89,26 @@ fn detection(b: &ModuleBox) -> Option<Detection> {
     let quad = Quad::from_unordered(b.quad().corners)?;
     Some(Detection { quad, score: b.score, source: b.source })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::detection::Source;
+
+    #[test]
+    fn only_what_stands_in_lattices_speaks_for_a_scale() {
+        let at = |x: f64, y: f64| ModuleBox {
+            center: Vector2::new(x, y),
+            u: Vector2::new(0.0, 30.0),
+            v: Vector2::new(20.0, 0.0),
+            score: 0.9,
+            source: Source::Unet,
+        };
+        let bench: Vec<ModuleBox> = (0..12).map(|k| at(20.4 * f64::from(k % 6), 30.6 * f64::from(k / 6))).collect();
+        let strays: Vec<ModuleBox> =
+            (0..20).map(|k| at(400.0 + 55.0 * f64::from(k), 37.0 * f64::from(k % 3))).collect();
+        assert_eq!(area_in_lattices_px2(&strays), 0.0);
+        let all: Vec<ModuleBox> = bench.iter().chain(&strays).copied().collect();
+        assert!((area_in_lattices_px2(&all) - 12.0 * 600.0).abs() < 1e-6);
+    }
+}

@@ -170,7 +170,7 @@ fn plane_through(points: &[Vector2<f64>], values: &[f64]) -> Vec<f64> {
 }
 
 /// Mean probability on a grid of 5 x 5 points over the inner 70 % of the box; nought where all lie outside.
-fn inside_mean(module: &ProbabilityMap, b: &ModuleBox) -> f64 {
+pub(super) fn inside_mean(module: &ProbabilityMap, b: &ModuleBox) -> f64 {
     let (mut sum, mut count) = (0.0, 0);
     for i in -2..=2 {
         for j in -2..=2 {

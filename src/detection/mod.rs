@@ -15,6 +15,7 @@ mod open;
 mod outline;
 mod periodicity;
 pub mod probability;
+mod profile;
 mod registration;
 pub mod runtime;
 pub mod scale;

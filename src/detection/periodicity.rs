@@ -6,14 +6,16 @@
 //! and all. Benches of one photo hold the same modules, and decide together which periods these are.
 
 use super::Source;
-use super::filter::OVERLAP;
+use super::filter::{OVERLAP, inside_mean};
 use super::mask_to_boxes::{Components, ModuleBox, middle};
 use super::outline::{FACE, Outline};
 use super::probability::ProbabilityMap;
+use super::profile::{ELONGATION, Period, Profile, SHORT_PX};
 use super::registration::{blurred, grey};
 use crate::geometry::Quad;
 use image::RgbImage;
-use nalgebra::{Matrix3, SMatrix, SVector, Vector2, Vector3};
+use imageproc::geometric_transformations::Projection;
+use nalgebra::{Vector2, Vector3};
 use rayon::prelude::*;
 
 /// Fewest pixels of an area that is looked at, and the least length and width of its outline.
@@ -23,27 +25,15 @@ const LEAST_SIZE: (usize, usize) = (20, 8);
 const COVERED: f64 = 0.85;
 /// Least part of an outline that is covered by faces.
 const FILLED: f64 = 0.85;
-/// Length of a module's short side in pixels of the mask, and of its long side in parts of that, as photos show them.
-const SHORT_PX: (f64, f64) = (9.0, 46.0);
-const ELONGATION: (f64, f64) = (1.25, 3.2);
 /// Sides of a module as seen from above, metres.
 const SHORT_M: (f64, f64) = (0.45, 1.45);
 const LONG_M: (f64, f64) = (0.85, 2.65);
 /// Half the length, in pixels, over which light and colour are taken out.
 const COARSE_PX: usize = 15;
-/// How far the ends of an outline may be off, in pixels of its length, and in which steps.
-const END_PX: i32 = 6;
-const END_STEP_PX: f64 = 0.5;
-/// Step between periods where one end is open: by so many pixels the last module moves.
-const OPEN_STEP_PX: f64 = 1.0;
 /// How far, in which steps, the end that the frame cuts off is turned against the other.
 const TURN_RAD: f64 = 0.02;
 const MOST_TURNS: i32 = 3;
-/// The best periods that are tried at each turn, and the steps that they may change by.
-const NEAR_PERIODS: usize = 4;
-const NEAR_STEPS: i32 = 6;
-/// The best periods of an axis, and the best pairs of both axes, that are weighed.
-const MOST_PERIODS: usize = 40;
+/// The best pairs of periods of both axes that are weighed.
 const MOST_PATTERNS: usize = 400;
 /// Twice the period explains as much: what a period must explain more for each doubling of the module's area.
 const DOUBLING: f64 = 0.06;
@@ -69,9 +59,6 @@ const CLOSE_LEAD: f64 = 0.08;
 const LEAST_COLUMNS: f64 = 6.0;
 /// Difference of counts at which the end of a bench is another module's.
 const OTHER_COUNT: f64 = 0.6;
-/// How far a whole bench may bend its pattern, and the end of an open one shift it, in modules; and the steps.
-const BENT: f64 = 0.5;
-const BENT_STEP: f64 = 0.05;
 /// A module of which the mask covers less of the middle is a hole.
 const PRESENT: f64 = 0.6;
 /// Edge of a module in parts of the pitch.
@@ -86,16 +73,6 @@ pub(super) struct View<'a> {
     pub pixel: Vector2<f64>,
     /// Ground sampling distance of the image in metres per pixel, where it is known.
     pub gsd_m: Option<f64>,
-}
-
-/// How one axis of a bench repeats itself.
-#[derive(Debug, Clone, Copy)]
-struct Period {
-    px: f64,
-    /// Modules along the axis; a whole number where both ends are seen.
-    count: f64,
-    /// Share of the variance that it explains, adjusted for its freedom.
-    explained: f64,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -276,9 +253,10 @@ impl Bench {
                     ((b - a + c - d) * (FACE_OF_PITCH / 2.0), (d - a + c - b) * (FACE_OF_PITCH / 2.0));
                 let (u, v) = if along.norm() > across.norm() { (along, across) } else { (across, along) };
                 let center = (a + b + c + d) / 4.0;
-                let score = middle_face(view.module, center, u, v);
+                let module = ModuleBox { center, u, v, score: 1.0, source: Source::Unet };
+                let score = inside_mean(view.module, &module);
                 if score > PRESENT {
-                    found.push(ModuleBox { center, u, v, score: score as f32, source: Source::Unet });
+                    found.push(ModuleBox { score: score as f32, ..module });
                 }
             }
         }
@@ -286,17 +264,11 @@ impl Bench {
     }
 }
 
-/// Mean probability of a face over the middle of a module.
-fn middle_face(module: &ProbabilityMap, center: Vector2<f64>, u: Vector2<f64>, v: Vector2<f64>) -> f64 {
-    let place = |k: usize| (k as f64 - 2.0) * 0.15;
-    (0..25).map(|k| module.at(center + u * place(k % 5) + v * place(k / 5))).sum::<f64>() / 25.0
-}
-
 /// A bench made upright: about one sample per pixel of the maps.
 struct Raster {
     columns: usize,
     rows: usize,
-    from_raster: Matrix3<f64>,
+    from_raster: Projection,
     /// Grey value and core probability (nought where the network knows no cores); `None` where no face or no photo is.
     samples: Vec<Option<Vector2<f64>>>,
     has_cores: bool,
@@ -311,7 +283,7 @@ impl Raster {
         if columns < LEAST_SIZE.0 || rows < LEAST_SIZE.1 || columns > most || rows > most {
             return None;
         }
-        let from_raster = homography(columns as f64, rows as f64, &outline.corners)?;
+        let from_raster = projection(columns as f64, rows as f64, &outline.corners)?;
         let mut raster = Self {
             columns,
             rows,
@@ -338,8 +310,7 @@ impl Raster {
 
     /// A place of the raster in pixels of the maps.
     fn place(&self, at: Vector2<f64>) -> Vector2<f64> {
-        let p = self.from_raster * Vector3::new(at.x, at.y, 1.0);
-        p.xy() / p.z
+        project(&self.from_raster, at)
     }
 
     /// Means over the rows (`along`) or over the columns, less what changes slowly.
@@ -369,122 +340,6 @@ impl Raster {
     }
 }
 
-/// What a bench shows along one axis.
-struct Profile {
-    is_seen: Vec<bool>,
-    channels: Vec<Vec<f64>>,
-}
-
-impl Profile {
-    fn length(&self) -> f64 {
-        self.is_seen.len() as f64
-    }
-
-    /// The share of the variance that repeats itself with the phase (in modules) of each place, adjusted for the number of
-    /// means that tell it.
-    fn explained(&self, period_px: f64, phase: impl Fn(f64) -> f64) -> f64 {
-        let bins = (period_px.round() as usize).max(8);
-        let places: Vec<(usize, usize)> = (0..self.is_seen.len())
-            .filter(|&k| self.is_seen[k])
-            .map(|k| (k, ((phase(k as f64 + 0.5).rem_euclid(1.0) * bins as f64) as usize).min(bins - 1)))
-            .collect();
-        let mut counts = vec![0.0_f64; bins];
-        for &(_, bin) in &places {
-            counts[bin] += 1.0;
-        }
-        let freedom = counts.iter().filter(|count| **count > 0.0).count() + 1;
-        if places.len() <= freedom {
-            return 0.0;
-        }
-        let share = |values: &Vec<f64>| {
-            let mut means = vec![0.0; bins];
-            for &(k, bin) in &places {
-                means[bin] += values[k] / counts[bin];
-            }
-            let rest: f64 = places.iter().map(|&(k, bin)| (values[k] - means[bin]).powi(2)).sum();
-            let whole: f64 = places.iter().map(|&(k, _)| values[k].powi(2)).sum();
-            if whole > 0.0 { rest / whole } else { 1.0 }
-        };
-        let left = self.channels.iter().map(share).sum::<f64>() / self.channels.len() as f64;
-        1.0 - left * (places.len() - 1) as f64 / (places.len() - freedom) as f64
-    }
-
-    /// The most that a period close to one of the best of `periods` explains.
-    fn explained_near(&self, periods: &[Period]) -> f64 {
-        let step = OPEN_STEP_PX / self.length();
-        let near = |px: f64| (-NEAR_STEPS..=NEAR_STEPS).map(move |k| px * (f64::from(k) * step).exp());
-        let tried = periods.iter().take(NEAR_PERIODS).flat_map(|period| near(period.px));
-        tried.map(|px| self.explained(px, |x| x / px)).fold(f64::NEG_INFINITY, f64::max)
-    }
-
-    /// The periods that explain most, best first. Where the axis is whole, it holds a whole number of modules.
-    fn periods(&self, is_whole: bool) -> Vec<Period> {
-        let (length, longest) = (self.length(), SHORT_PX.1 * ELONGATION.1);
-        let mut found: Vec<Period> = Vec::new();
-        if is_whole {
-            for count in 1..=(length / SHORT_PX.0) as usize {
-                let count = count as f64;
-                if length / count > longest {
-                    continue;
-                }
-                let ends = (-END_PX..=END_PX).map(|step| length + f64::from(step) * END_STEP_PX);
-                let tried = ends.map(|end| {
-                    let px = end / count;
-                    let explained = if count > 1.0 { self.explained(px, |x| x / px) } else { 0.0 };
-                    Period { px, count, explained }
-                });
-                found.extend(tried.max_by(|a, b| a.explained.total_cmp(&b.explained)));
-            }
-        } else {
-            let steps = ((longest.min(length / 2.0) / SHORT_PX.0).ln() * length / OPEN_STEP_PX).max(0.0) as usize;
-            let tried: Vec<Period> = (0..steps)
-                .map(|step| SHORT_PX.0 * (step as f64 * OPEN_STEP_PX / length).exp())
-                .map(|px| Period { px, count: length / px, explained: self.explained(px, |x| x / px) })
-                .collect();
-            found.extend(tried.windows(3).filter_map(|near| {
-                let [before, own, after] = near else { return None };
-                (own.explained >= before.explained && own.explained >= after.explained).then_some(*own)
-            }));
-        }
-        found.sort_by(|a, b| b.explained.total_cmp(&a.explained));
-        found.truncate(MOST_PERIODS);
-        found
-    }
-
-    /// Where modules begin and end along the axis, from its start: the period, bent and, where the end is open, stretched so
-    /// that it explains most, for perspective and the lens leave no pitch quite even.
-    fn places(&self, period: &Period, is_whole: bool) -> Vec<f64> {
-        let (length, count) = (self.length(), period.count);
-        let phase = |x: f64, stretch: f64, bend: f64| {
-            let part = x / length;
-            x / period.px + stretch * part + bend * part * (part - 1.0)
-        };
-        let most = (BENT / BENT_STEP) as i32;
-        let range = || (-most..=most).map(|step| f64::from(step) * BENT_STEP);
-        let mut best = (f64::NEG_INFINITY, 0.0, 0.0);
-        for stretch in range().filter(|stretch| !is_whole || *stretch == 0.0) {
-            for bend in range() {
-                // Straight unless the photo says otherwise.
-                let explained =
-                    self.explained(period.px, |x| phase(x, stretch, bend)) - 1e-3 * (stretch.abs() + bend.abs());
-                if explained > best.0 {
-                    best = (explained, stretch, bend);
-                }
-            }
-        }
-        let (_, stretch, bend) = best;
-        let last = if is_whole { count.round() } else { (count + stretch + 0.15).floor() } as usize;
-        let place = |module: usize| {
-            let mut x = module as f64 * period.px;
-            for _ in 0..4 {
-                x -= (phase(x, stretch, bend) - module as f64) * period.px;
-            }
-            if is_whole { x * length / (count * period.px) } else { x }
-        };
-        (0..=last).map(place).collect()
-    }
-}
-
 impl View<'_> {
     /// Whether sides of so many pixels of the maps can be a module's on the ground.
     fn allows(&self, short: f64, long: f64) -> bool {
@@ -507,20 +362,16 @@ impl View<'_> {
     }
 }
 
-/// The homography from a rectangle of the given size, its first corner at the origin, to a quadrilateral.
-fn homography(width: f64, height: f64, corners: &[Vector2<f64>; 4]) -> Option<Matrix3<f64>> {
-    let from = [(0.0, 0.0), (width, 0.0), (width, height), (0.0, height)];
-    let (mut matrix, mut right) = (SMatrix::<f64, 8, 8>::zeros(), SVector::<f64, 8>::zeros());
-    for (k, ((x, y), to)) in from.into_iter().zip(corners).enumerate() {
-        let rows = [[x, y, 1.0, 0.0, 0.0, 0.0, -x * to.x, -y * to.x], [0.0, 0.0, 0.0, x, y, 1.0, -x * to.y, -y * to.y]];
-        for (axis, row) in rows.into_iter().enumerate() {
-            matrix.row_mut(2 * k + axis).copy_from_slice(&row);
-            right[2 * k + axis] = to[axis];
-        }
-    }
-    let h = matrix.lu().solve(&right)?;
-    let found = Matrix3::new(h[0], h[1], h[2], h[3], h[4], h[5], h[6], h[7], 1.0);
-    found.iter().all(|value| value.is_finite()).then_some(found)
+/// The projection from a rectangle of the given size, its first corner at the origin, to a quadrilateral.
+fn projection(width: f64, height: f64, corners: &[Vector2<f64>; 4]) -> Option<Projection> {
+    let from = [(0.0, 0.0), (width, 0.0), (width, height), (0.0, height)].map(|(x, y)| (x as f32, y as f32));
+    Projection::from_control_points(from, corners.map(|corner| (corner.x as f32, corner.y as f32)))
+}
+
+/// A place projected.
+fn project(projection: &Projection, at: Vector2<f64>) -> Vector2<f64> {
+    let (x, y) = *projection * (at.x as f32, at.y as f32);
+    Vector2::new(f64::from(x), f64::from(y))
 }
 
 #[cfg(test)]
@@ -559,13 +410,12 @@ mod tests {
 
     /// A photo of modules whose cell grid is far brighter than their dark seams.
     fn photo(modules: &[Quad], width: u32, grid: f64) -> RgbImage {
-        let inverse: Vec<Matrix3<f64>> =
-            modules.iter().map(|quad| homography(4.0, 6.0, &quad.corners).unwrap().try_inverse().unwrap()).collect();
+        let inverse: Vec<Projection> =
+            modules.iter().map(|quad| projection(4.0, 6.0, &quad.corners).unwrap().invert()).collect();
         RgbImage::from_fn(width, SIZE.1, |x, y| {
             let value = mean_of_9(x as usize, y as usize, |at| {
                 let Some(index) = modules.iter().position(|quad| quad.contains(at)) else { return 130.0 };
-                let p = inverse[index] * Vector3::new(at.x, at.y, 1.0);
-                let cell = p.xy() / p.z;
+                let cell = project(&inverse[index], at);
                 let border = cell.x.min(4.0 - cell.x).min(cell.y).min(6.0 - cell.y);
                 // Frames and the margins within push the cells together.
                 let line = |value: f64, count: f64| {
@@ -649,6 +499,17 @@ mod tests {
         let mut truth = modules();
         truth.remove(COLUMNS + 5);
         assert_found(&parted(Vec::new(), &truth, SIZE.0, 110.0), &truth);
+    }
+
+    #[test]
+    fn what_no_module_measures_on_the_ground_is_no_module() {
+        let (image, module) = (RgbImage::new(1, 1), ProbabilityMap::new(1, 1));
+        let view = |gsd_m| View { image: &image, module: &module, core: None, pixel: Vector2::repeat(2.0), gsd_m };
+        // 1.0 x 1.6 m, then two rows in one, then half a module.
+        assert!(view(Some(0.02)).allows(25.0, 40.0));
+        assert!(!view(Some(0.02)).allows(25.0, 80.0));
+        assert!(!view(Some(0.02)).allows(12.5, 20.0) && !view(Some(0.02)).allows(10.0, 40.0));
+        assert!(view(None).allows(25.0, 80.0));
     }
 
     #[test]
