@@ -9,14 +9,14 @@ use crate::jobs;
 use crate::plant::PlantId;
 use crate::reconstruction::PhotoFacts;
 use crate::reconstruction::quality::Flaw;
-use crate::store::{FileKind, FileRecord, SurveyId, SurveyPath};
+use crate::store::{Digest, FileKind, FileRecord, SurveyId, SurveyPath};
 use axum::extract::State;
 use axum::http::header;
 use axum::response::{IntoResponse, Response};
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, HashMap};
 
 /// Photos per look into the store.
 const CHUNK: u32 = 1000;
@@ -231,10 +231,38 @@ impl ImagesQuery {
     }
 }
 
+/// Photos of a survey by their bytes.
+#[derive(Default)]
+struct Alike(HashMap<Digest, Vec<SurveyPath>>);
+
+impl FromIterator<(Digest, SurveyPath)> for Alike {
+    fn from_iter<T: IntoIterator<Item = (Digest, SurveyPath)>>(photos: T) -> Self {
+        let mut alike = Self::default();
+        for (sha256, path) in photos {
+            alike.0.entry(sha256).or_default().push(path);
+        }
+        alike
+    }
+}
+
+impl Alike {
+    /// Other photos with the bytes of a photo, the first few.
+    fn twins(&self, file: &FileRecord) -> Vec<SurveyPath> {
+        let same = self.0.get(&file.sha256).filter(|_| file.path.kind() == FileKind::Image);
+        same.into_iter()
+            .flatten()
+            .filter(|path| **path != file.path)
+            .take(intake::MAX_TWINS as usize)
+            .cloned()
+            .collect()
+    }
+}
+
 /// The photos of a survey, part by part, each with its verdict.
 struct Photos<'a> {
     state: &'a AppState,
     survey: SurveyId,
+    alike: Alike,
     shots: Option<BTreeSet<String>>,
 }
 
@@ -247,13 +275,14 @@ impl<'a> Photos<'a> {
                 break;
             }
         }
-        Ok(Self { state, survey, shots })
+        let alike = state.store.photos_alike(survey).await?.into_iter().collect();
+        Ok(Self { state, survey, alike, shots })
     }
 
     async fn part(&self, after: &str, limit: u32) -> Result<Vec<ImageView>, ApiError> {
         let mut images = Vec::new();
         for file in self.state.store.photos(self.survey, after, limit).await? {
-            let twins = intake::twins(self.state, self.survey, &file).await?;
+            let twins = self.alike.twins(&file);
             let name = file.path.file_name().to_owned();
             let reconstructed = self.shots.as_ref().map(|shots| jobs::is_shot(shots, &name));
             images.push(ImageView { name, reconstructed, file: FileView::new(file, &twins) });
@@ -414,13 +443,10 @@ pub fn summary(files: Vec<FileRecord>) -> (ImagesSummary, Vec<FileView>) {
     let not_uploaded = jobs::shots_without_image(&files);
     let with_position =
         files.iter().filter(|file| file.photo.as_ref().is_some_and(|photo| photo.exposure.position.is_some())).count();
-    let mut of_digest: std::collections::HashMap<_, Vec<SurveyPath>> = Default::default();
-    for file in files.iter().filter(|file| file.path.kind() == FileKind::Image) {
-        of_digest.entry(file.sha256).or_default().push(file.path.clone());
-    }
+    let photos = files.iter().filter(|file| file.path.kind() == FileKind::Image);
+    let alike: Alike = photos.map(|file| (file.sha256, file.path.clone())).collect();
     let view = |file: FileRecord| {
-        let same = of_digest.get(&file.sha256).filter(|_| file.path.kind() == FileKind::Image);
-        let twins: Vec<_> = same.into_iter().flatten().filter(|path| **path != file.path).take(5).cloned().collect();
+        let twins = alike.twins(&file);
         FileView::new(file, &twins)
     };
     let views: Vec<FileView> = files.into_iter().map(view).collect();

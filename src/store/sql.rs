@@ -122,6 +122,10 @@ pub const PHOTOS: &str = concat!(
     file!(),
     " FROM files WHERE survey_id = $1 AND kind = 'image' AND path > $2 ORDER BY path LIMIT $3"
 );
+pub const PHOTOS_ALIKE: &str = "\
+    SELECT sha256, path FROM files WHERE survey_id = $1 AND kind = 'image' AND sha256 IN (\
+        SELECT sha256 FROM files WHERE survey_id = $1 AND kind = 'image' GROUP BY sha256 HAVING COUNT(*) > 1\
+    ) ORDER BY path";
 pub const PHOTOS_OF_DIGEST: &str = "\
     SELECT path FROM files WHERE survey_id = $1 AND sha256 = $2 AND kind = 'image' ORDER BY path LIMIT $3";
 

@@ -153,6 +153,8 @@ pub async fn photos_and_what_was_found_in_them(store: &dyn Store) {
     let same = store.photos_of_digest(survey.id, Digest::of(b"1"), 9).await.unwrap();
     assert_eq!(same.iter().map(SurveyPath::as_str).collect::<Vec<_>>(), ["images/a.jpg", "images/b.jpg"]);
     assert_eq!(store.photos_of_digest(survey.id, Digest::of(b"1"), 1).await.unwrap().len(), 1);
+    let alike = store.photos_alike(survey.id).await.unwrap();
+    assert_eq!(alike, same.into_iter().map(|path| (Digest::of(b"1"), path)).collect::<Vec<_>>());
 }
 
 pub async fn one_unfinished_job_per_survey(store: &dyn Store) {

@@ -30,7 +30,7 @@ pub struct Stored {
 }
 
 /// How many photos with the same bytes are named.
-const MAX_TWINS: u32 = 5;
+pub const MAX_TWINS: u32 = 5;
 
 /// Checks that a staged file holds what its place in the survey says.
 pub async fn check(state: &AppState, path: SurveyPath, staged: StagedFile) -> Result<Checked, ApiError> {
@@ -85,7 +85,7 @@ pub async fn store(
 }
 
 /// Other photos of the survey with the bytes of a photo, the first few.
-pub async fn twins(state: &AppState, survey: SurveyId, file: &FileRecord) -> Result<Vec<SurveyPath>, ApiError> {
+async fn twins(state: &AppState, survey: SurveyId, file: &FileRecord) -> Result<Vec<SurveyPath>, ApiError> {
     if file.path.kind() != FileKind::Image {
         return Ok(Vec::new());
     }

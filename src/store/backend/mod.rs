@@ -191,6 +191,11 @@ impl Store for Rows {
         query.fetch_all(&self.read).await?.iter().map(file).collect()
     }
 
+    async fn photos_alike(&self, survey: SurveyId) -> Result<Vec<(Digest, SurveyPath)>, StoreError> {
+        let query = sqlx::query(sql::PHOTOS_ALIKE).bind(survey.to_string());
+        query.fetch_all(&self.read).await?.iter().map(read::digest_and_path).collect()
+    }
+
     async fn photos_of_digest(
         &self,
         survey: SurveyId,

@@ -4,7 +4,7 @@ use super::super::Row;
 use crate::plant::{PlantId, Warning};
 use crate::store::requests::KeptAnswer;
 use crate::store::{
-    ApiKey, AuditEntry, FileRecord, Job, JobId, KeyId, Model, Organisation, OrganisationId, Plant, Progress,
+    ApiKey, AuditEntry, Digest, FileRecord, Job, JobId, KeyId, Model, Organisation, OrganisationId, Plant, Progress,
     StoreError, Survey, SurveyId, SurveyPath, Upload, UploadId,
 };
 use jiff::Timestamp;
@@ -78,6 +78,10 @@ pub fn survey(row: &Row) -> Result<Survey, StoreError> {
 pub fn path(row: &Row) -> Result<SurveyPath, StoreError> {
     let path: String = row.try_get("path")?;
     SurveyPath::parse(&path).map_err(|_| StoreError::Corrupt { what: "path of a file", value: path })
+}
+
+pub fn digest_and_path(row: &Row) -> Result<(Digest, SurveyPath), StoreError> {
+    Ok((parsed(row, "sha256")?, path(row)?))
 }
 
 pub fn file(row: &Row) -> Result<FileRecord, StoreError> {
