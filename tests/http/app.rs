@@ -24,6 +24,12 @@ use tempfile::TempDir;
 use tokio::sync::Notify;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
+/// Sends requests.
+fn client() -> Client {
+    heliomap::tls::provide();
+    Client::new()
+}
+
 /// What the mapper does when it is called.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Act {
@@ -249,7 +255,7 @@ impl App {
         let stop = CancellationToken::new();
         let base = self.again(limits, Arc::default(), stop.clone()).await;
         let mapper = self.mapper.clone();
-        let (client, metrics, blobs) = (Client::new(), Metrics::default(), self.blobs.clone());
+        let (client, metrics, blobs) = (client(), Metrics::default(), self.blobs.clone());
         let (folder, store, secret) = (tempfile::tempdir().unwrap(), self.store.clone(), self.secret.clone());
         let cancelled = stop.clone();
         let app =
@@ -352,7 +358,7 @@ impl App {
         };
         let (app, closing) = (router(state), cancelled.clone());
         tokio::spawn(async move { serve(listener, app, &served, closing).await });
-        let (client, secret) = (Client::new(), None);
+        let (client, secret) = (client(), None);
         Self { base, client, mapper, folder, store, secret, metrics, blobs, cancelled, _stop: stop.drop_guard() }
     }
 

@@ -8,6 +8,12 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
+/// Sends requests.
+fn client() -> Client {
+    heliomap::tls::provide();
+    Client::new()
+}
+
 /// A running program that is killed when dropped.
 struct Program(Child);
 
@@ -97,7 +103,7 @@ fn follow(client: &Client, base: &str, job: &Value) -> Value {
 #[test]
 fn what_was_acknowledged_survives_a_kill_and_the_program_stops_when_told() {
     let data = tempfile::tempdir().unwrap();
-    let client = Client::new();
+    let client = client();
     let (program, base) = serve(data.path(), &["--no-worker"]);
     let (survey, job) = broken_survey_with_job(&client, &base);
     drop(program);
@@ -113,7 +119,7 @@ fn what_was_acknowledged_survives_a_kill_and_the_program_stops_when_told() {
 #[test]
 fn a_worker_of_its_own_takes_the_jobs_of_a_server_without_one() {
     let data = tempfile::tempdir().unwrap();
-    let client = Client::new();
+    let client = client();
     let (_server, base) = serve(data.path(), &["--no-worker"]);
     let (_, job) = broken_survey_with_job(&client, &base);
     let (worker, line) = start(data.path(), &["worker"]);
@@ -127,7 +133,7 @@ fn a_worker_of_its_own_takes_the_jobs_of_a_server_without_one() {
 #[test]
 fn a_broken_reconstruction_fails_its_job() {
     let data = tempfile::tempdir().unwrap();
-    let client = Client::new();
+    let client = client();
     let (_program, base) = serve(data.path(), &[]);
     let (_, job) = broken_survey_with_job(&client, &base);
     let job = follow(&client, &base, &job);
@@ -150,7 +156,7 @@ fn without_a_key_nobody_gets_in() {
     let secret = keys(&["create", "--name", "first", "--scope", "admin"]);
     let (_program, line) = start(data.path(), &["serve", "--no-worker", "--listen", "127.0.0.1:0"]);
     let plants = format!("{}/api/v1/plants", line.trim().strip_prefix("heliomap is listening on ").unwrap());
-    let client = Client::new();
+    let client = client();
     let status = |secret: &str| client.get(&plants).bearer_auth(secret).send().unwrap().status();
     assert_eq!(client.get(&plants).send().unwrap().status(), StatusCode::UNAUTHORIZED);
     assert_eq!((status("hm_wrong"), status(&secret)), (StatusCode::UNAUTHORIZED, StatusCode::OK));
@@ -199,7 +205,7 @@ fn logs_name_requests_and_jobs_and_hold_no_secret() {
     BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
     let program = Program(child);
     let base = line.trim().strip_prefix("heliomap is listening on ").unwrap();
-    let client = Client::new();
+    let client = client();
     let (secret, password) = ("hm_5ec2e75ec2e75ec2e7", "pa55w0rd");
     let request = client.get(format!("{base}/api/v1/plants")).header("x-request-id", "call-7").bearer_auth(secret);
     assert_eq!(request.header("cookie", password).send().unwrap().status(), StatusCode::OK);
@@ -239,7 +245,7 @@ fn metrics_are_told_on_a_listener_of_their_own() {
     let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
     let _program = Program(child);
     let address = lines.find_map(|line| line.unwrap().strip_prefix("metrics are on ").map(str::to_owned)).unwrap();
-    let answer = Client::new().get(address).send().unwrap();
+    let answer = client().get(address).send().unwrap();
     assert!(answer.headers()["content-type"].to_str().unwrap().starts_with("application/openmetrics-text"));
     assert!(answer.text().unwrap().contains("heliomap_queue_depth 0"));
 }
