@@ -48,14 +48,18 @@ lint: setup ## Formatting and lints, warnings are errors
 	$(CARGO) fmt --check
 	$(CARGO) clippy --locked --all-targets -- --deny warnings
 
-unit: setup ## Tests alone
-	tests/with-postgres.sh $(CARGO) test --locked
+unit: setup .venv/s3/done ## Tests alone
+	tests/with-postgres.sh tests/with-s3.sh $(CARGO) test --locked
 	$(MAKE) --no-print-directory client
 
 client: setup ## The Python client and every command of docs/API.md against the real service
 	@command -v jq >/dev/null || { apt-get update -qq && apt-get install -qq --yes --no-install-recommends jq >/dev/null; }
 	$(CARGO) test --locked --no-run
 	$(PYTHON) -m unittest discover --start-directory tests/clients
+
+.venv/s3/done: tests/s3/requirements.txt
+	@$(PYTHON) -m venv .venv/s3 && .venv/s3/bin/pip install --quiet --disable-pip-version-check --requirement $<
+	@touch $@
 
 KILLS ?= 200
 kills: setup ## Kill server and worker at random (KILLS times, half of them on Postgres): nothing is lost, models are the same

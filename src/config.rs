@@ -2,7 +2,7 @@
 
 use crate::detection::{self, DetectionError, Detector, ExecutionProvider, RuntimeSettings};
 use crate::plant::PlantId;
-use crate::store::{KeyId, Scope};
+use crate::store::{Bucket, KeyId, Scope};
 use axum::http::HeaderValue;
 use clap::{Args, Subcommand, ValueEnum};
 use std::net::SocketAddr;
@@ -166,12 +166,18 @@ pub struct StorageArgs {
     /// Postgres database to use in place of the SQLite file in the data folder, `postgres://USER:PASSWORD@HOST/NAME`.
     #[arg(long, env = "HELIOMAP_DATABASE", hide_env_values = true, value_name = "URL")]
     pub database: Option<String>,
+    /// Place in an S3-compatible store for the uploaded files and the models, in place of the data folder,
+    /// `s3://BUCKET/PREFIX`. Endpoint, region and credentials come from the variables AWS_ENDPOINT_URL, AWS_REGION,
+    /// AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and the others that programs for S3 take.
+    #[arg(long, env = "HELIOMAP_BLOBS", value_name = "URL")]
+    pub blobs: Option<Bucket>,
 }
 
 /// The database's URL may hold a password, which no log shall.
 impl std::fmt::Debug for StorageArgs {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("StorageArgs").field("data_dir", &self.data_dir).finish_non_exhaustive()
+        let mut known = f.debug_struct("StorageArgs");
+        known.field("data_dir", &self.data_dir).field("blobs", &self.blobs).finish_non_exhaustive()
     }
 }
 

@@ -16,6 +16,7 @@ use heliomap::jobs::{PipelineMapper, Worker, WorkerSettings};
 use heliomap::store::{Blobs, PostgresStore, SqliteStore, Store};
 use heliomap::telemetry::metrics::{self, Metrics, Scrape};
 use jiff::Timestamp;
+use object_store::aws::AmazonS3Builder;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::net::TcpListener;
@@ -32,7 +33,21 @@ const GRACE: Duration = Duration::from_secs(20);
 async fn open_storage(args: &StorageArgs) -> anyhow::Result<(Arc<dyn Store>, Blobs)> {
     let folder = &args.data_dir;
     let hint = || format!("cannot use the data folder {}; choose another with --data-dir", folder.display());
-    let blobs = Blobs::in_folder(folder).with_context(hint)?;
+    let blobs = match &args.blobs {
+        None => Blobs::in_folder(folder).with_context(hint)?,
+        Some(bucket) => {
+            let hint = || {
+                format!(
+                    "cannot use the bucket {} of --blobs; check that it is there, and AWS_ENDPOINT_URL, AWS_REGION, \
+                     AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY",
+                    bucket.name
+                )
+            };
+            let blobs = Blobs::in_bucket(folder, bucket, AmazonS3Builder::from_env()).with_context(hint)?;
+            blobs.ping().await.with_context(hint)?;
+            blobs
+        }
+    };
     blobs.sweep_staging(STALE_UPLOADS).await.with_context(hint)?;
     let store: Arc<dyn Store> = match &args.database {
         // The URL may hold a password: it is not said again.

@@ -1,9 +1,11 @@
 //! Bytes: content-addressed within a plant, so that what is stored once is never half-written, a plant's deletion
 //! deletes everything of it, and nobody learns from an upload what another plant holds.
 
-use super::{StoreError, UploadId};
+use super::{Bucket, StoreError, UploadId};
 use crate::plant::PlantId;
 use futures::TryStreamExt;
+use object_store::aws::AmazonS3Builder;
+use object_store::buffered::BufWriter;
 use object_store::local::LocalFileSystem;
 use object_store::path::Path as Key;
 use object_store::{ObjectStore, ObjectStoreExt};
@@ -17,6 +19,18 @@ use std::sync::Arc;
 use std::time::Duration;
 use tempfile::TempPath;
 use tokio::io::AsyncWriteExt;
+use tokio::sync::Semaphore;
+use tokio_util::io::ReaderStream;
+
+/// A blob goes to a bucket in parts of so many bytes: 10,000 of them, which is the most, make 160 GiB.
+const PART_BYTES: usize = 16 << 20;
+/// Parts of one blob on their way at once.
+const PARTS_AT_ONCE: usize = 2;
+/// Blobs on their way to a bucket at once, so that uploads that come together take no more memory than these; the others
+/// wait on disk.
+const SENDERS: usize = 4;
+/// Bytes read from disk at once on the way to a bucket.
+const READ_BYTES: usize = 1 << 20;
 
 /// A SHA-256 digest.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -84,19 +98,33 @@ pub struct Blobs {
     local: Option<PathBuf>,
     staging: PathBuf,
     uploads: PathBuf,
+    /// One permit for each blob that may be on its way to a bucket.
+    senders: Arc<Semaphore>,
 }
 
 impl Blobs {
     /// Blobs in the folder `blobs` of a data folder, files on their way in `incoming`, uploads that may be resumed in
     /// `uploads`.
     pub fn in_folder(data: &Path) -> Result<Self, StoreError> {
-        let (root, staging, uploads) = (data.join("blobs"), data.join("incoming"), data.join("uploads"));
-        for folder in [&root, &staging, &uploads] {
-            std::fs::create_dir_all(folder).map_err(io("create the folder", folder))?;
-        }
+        let root = data.join("blobs");
+        std::fs::create_dir_all(&root).map_err(io("create the folder", &root))?;
         let root = root.canonicalize().map_err(io("open the folder", &root))?;
         let store = LocalFileSystem::new_with_prefix(&root)?;
-        Ok(Self { store: Arc::new(store), local: Some(root), staging, uploads })
+        Self::new(Arc::new(store), Some(root), data)
+    }
+
+    /// Blobs in an S3-compatible store, which `settings` tell how to reach; what is on its way in stays in the data folder
+    /// of this machine until it is whole.
+    pub fn in_bucket(data: &Path, bucket: &Bucket, settings: AmazonS3Builder) -> Result<Self, StoreError> {
+        Self::new(bucket.open(settings)?, None, data)
+    }
+
+    fn new(store: Arc<dyn ObjectStore>, local: Option<PathBuf>, data: &Path) -> Result<Self, StoreError> {
+        let (staging, uploads) = (data.join("incoming"), data.join("uploads"));
+        for folder in [&staging, &uploads] {
+            std::fs::create_dir_all(folder).map_err(io("create the folder", folder))?;
+        }
+        Ok(Self { store, local, staging, uploads, senders: Arc::new(Semaphore::new(SENDERS)) })
     }
 
     /// The local folder for files on their way in and for the folders of running jobs.
@@ -153,11 +181,33 @@ impl Blobs {
                 let target = root.join(key.as_ref());
                 run_blocking("store the file", target.clone(), move || move_into_place(file.path, &target)).await
             }
-            None => {
-                let mut upload = object_store::buffered::BufWriter::new(self.store.clone(), key);
-                let mut source = tokio::fs::File::open(&file.path).await.map_err(io("open", &file.path))?;
-                tokio::io::copy(&mut source, &mut upload).await.map_err(io("store", &file.path))?;
-                upload.shutdown().await.map_err(io("store", &file.path))
+            None => self.send(key, file).await,
+        }
+    }
+
+    /// Sends a staged file to the bucket, in parts where it is large, unless it is there.
+    async fn send(&self, key: Key, file: StagedFile) -> Result<(), StoreError> {
+        match self.store.head(&key).await {
+            Ok(there) if there.size == file.size => return Ok(()),
+            Ok(_) | Err(object_store::Error::NotFound { .. }) => {}
+            Err(error) => return Err(error.into()),
+        }
+        // The semaphore is never closed.
+        let _turn = self.senders.acquire().await;
+        let source = tokio::fs::File::open(&file.path).await.map_err(io("open", &file.path))?;
+        let mut source = ReaderStream::with_capacity(source, READ_BYTES);
+        let mut upload =
+            BufWriter::with_capacity(self.store.clone(), key, PART_BYTES).with_max_concurrency(PARTS_AT_ONCE);
+        loop {
+            let sent = match source.try_next().await {
+                Ok(None) => return upload.shutdown().await.map_err(io("store", &file.path)),
+                Ok(Some(bytes)) => upload.put(bytes).await.map_err(StoreError::from),
+                Err(error) => Err(io("read", &file.path)(error)),
+            };
+            if let Err(error) = sent {
+                // Else the parts that came would stay, and cost.
+                let _ = upload.abort().await;
+                return Err(error);
             }
         }
     }
@@ -179,7 +229,8 @@ impl Blobs {
 
     /// All bytes of a blob.
     pub async fn get(&self, plant: PlantId, sha256: Digest) -> Result<bytes::Bytes, StoreError> {
-        Ok(self.store.get(&key(plant, sha256)).await?.bytes().await?)
+        let bytes = self.store.get(&key(plant, sha256)).await?.bytes().await?;
+        if Digest::of(&bytes) == sha256 { Ok(bytes) } else { Err(StoreError::Damaged { plant, sha256 }) }
     }
 
     /// Makes a blob appear as the file `target`, which must not be written to.
@@ -193,10 +244,13 @@ impl Blobs {
         }
         let mut file = tokio::fs::File::create(target).await.map_err(io("create", target))?;
         let mut chunks = self.store.get(&key).await?.into_stream();
+        let mut hasher = sha2::Sha256::new();
         while let Some(chunk) = chunks.try_next().await? {
+            hasher.update(&chunk);
             file.write_all(&chunk).await.map_err(io("write", target))?;
         }
-        file.flush().await.map_err(io("write", target))
+        file.flush().await.map_err(io("write", target))?;
+        if Digest(hasher.finalize().into()) == sha256 { Ok(()) } else { Err(StoreError::Damaged { plant, sha256 }) }
     }
 
     /// Deletes everything of a plant.

@@ -5,6 +5,7 @@
 
 pub mod access;
 pub mod blobs;
+pub mod bucket;
 pub mod postgres;
 pub mod records;
 pub mod requests;
@@ -17,6 +18,7 @@ mod sql;
 
 pub use access::{AccessStore, ApiKey, AuditEntry, KeyId, NewKey, Organisation, OrganisationId, Scope, SecretRecord};
 pub use blobs::{Blobs, Digest, StagedFile};
+pub use bucket::Bucket;
 pub use postgres::PostgresStore;
 pub use records::{
     Cancelled, Checkpoint, Claim, Completed, Created, Ending, Enqueued, Feature, FeatureQuery, FileRecord, FileWritten,
@@ -49,6 +51,9 @@ pub enum StoreError {
     /// The blob store failed.
     #[error("blob store: {0}")]
     Blob(#[from] object_store::Error),
+    /// A blob is not what was stored.
+    #[error("the blob {sha256} of plant {plant} is damaged: it holds other bytes; put it back from a backup")]
+    Damaged { plant: PlantId, sha256: Digest },
     /// The file system failed.
     #[error("{action} {path}: {source}")]
     Io { action: &'static str, path: std::path::PathBuf, source: std::io::Error },

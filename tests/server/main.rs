@@ -232,6 +232,54 @@ fn logs_name_requests_and_jobs_and_hold_no_secret() {
     assert!(!output.status.success() && text.contains("--database") && !text.contains(password), "{text}");
 }
 
+/// Files go to a bucket and come from it, everything of a plant goes with it, and the bucket's secret is in no log.
+#[test]
+fn blobs_lie_in_a_bucket() {
+    let Ok(endpoint) = std::env::var("HELIOMAP_TEST_S3") else {
+        println!("skipped: no S3-compatible server; `make unit` starts one, and so does tests/with-s3.sh");
+        return;
+    };
+    let data = tempfile::tempdir().unwrap();
+    let prefix = data.path().file_name().unwrap().to_str().unwrap().trim_start_matches('.').to_owned();
+    let secret = "5ec2e7-0f-the-bucket";
+    let command = |blobs: String| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_heliomap"));
+        command
+            .args(["serve", "--insecure", "--listen", "127.0.0.1:0", "--log", "trace", "--blobs", &blobs])
+            .env("HELIOMAP_DATA_DIR", data.path())
+            .envs([("AWS_ENDPOINT_URL", endpoint.as_str()), ("AWS_REGION", "eu-central-1")])
+            .envs([("AWS_ACCESS_KEY_ID", "heliomap"), ("AWS_SECRET_ACCESS_KEY", secret)]);
+        command
+    };
+    let output = command("s3://no-such-bucket".to_owned()).output().unwrap();
+    let text = String::from_utf8_lossy(&output.stderr);
+    assert!(!output.status.success() && text.contains("--blobs") && !text.contains(secret), "{text}");
+
+    let mut child = command(format!("s3://heliomap-tests/{prefix}"))
+        .stdout(Stdio::piped())
+        .stderr(std::fs::File::create(data.path().join("log")).unwrap())
+        .spawn()
+        .unwrap();
+    let mut line = String::new();
+    BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+    let program = Program(child);
+    let base = line.trim().strip_prefix("heliomap is listening on ").expect("the address is printed");
+    let client = client();
+    let (_, job) = broken_survey_with_job(&client, base);
+    let job = follow(&client, base, &job);
+    assert_eq!(job["error"]["code"], "reconstruction_malformed", "{job}");
+    assert!(!data.path().join("blobs").exists());
+    let list = format!("{endpoint}/heliomap-tests?list-type=2&prefix={prefix}/");
+    let list = || client.get(&list).send().unwrap().text().unwrap();
+    assert_eq!(list().matches("<Key>").count(), 3, "two photos of the same bytes, and two files: {}", list());
+    let plant = format!("{base}/api/v1/plants/{}", job["plant"].as_str().unwrap());
+    assert_eq!(client.delete(plant).send().unwrap().status(), StatusCode::NO_CONTENT);
+    assert_eq!(list().matches("<Key>").count(), 0, "{}", list());
+    assert!(program.terminate().success());
+    let log = std::fs::read_to_string(data.path().join("log")).unwrap();
+    assert!(log.len() > 1000 && !log.contains(secret), "the log holds the bucket's secret");
+}
+
 #[test]
 fn metrics_are_told_on_a_listener_of_their_own() {
     let data = tempfile::tempdir().unwrap();

@@ -1,5 +1,6 @@
-//! What every store must do, whichever database is behind it.
+//! What every store must do, whichever database is behind it, and every blob store, wherever its bytes lie.
 
+mod blobs;
 mod conformance;
 
 use heliomap::store::{PostgresStore, SqliteStore};
