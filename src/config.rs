@@ -2,7 +2,9 @@
 
 use crate::detection::{self, DetectionError, Detector, ExecutionProvider, RuntimeSettings};
 use crate::plant::PlantId;
+use crate::store::usage::{Quotas, UNLIMITED};
 use crate::store::{Bucket, KeyId, Scope};
+use crate::webhooks::Targets;
 use axum::http::HeaderValue;
 use clap::{Args, Subcommand, ValueEnum};
 use std::net::SocketAddr;
@@ -50,6 +52,8 @@ pub struct ServeArgs {
     #[command(flatten)]
     pub network: NetworkArgs,
     #[command(flatten)]
+    pub webhooks: WebhookArgs,
+    #[command(flatten)]
     pub metrics: MetricsArgs,
     #[command(flatten)]
     pub limits: Limits,
@@ -67,6 +71,22 @@ pub struct NetworkArgs {
     pub behind_proxy: bool,
 }
 
+/// Who is told of the ends of jobs.
+#[derive(Debug, Clone, Default, Args)]
+pub struct WebhookArgs {
+    /// Let webhooks lead to this machine and to private networks, and be told without TLS. Whoever may make webhooks can then
+    /// have this service send requests to whatever it can reach.
+    #[arg(long, env = "HELIOMAP_WEBHOOK_PRIVATE_TARGETS")]
+    pub webhook_private_targets: bool,
+}
+
+impl WebhookArgs {
+    /// Where they may lead.
+    pub fn targets(&self) -> Targets {
+        if self.webhook_private_targets { Targets::Any } else { Targets::Public }
+    }
+}
+
 /// Where the process tells what it counts.
 #[derive(Debug, Clone, Default, Args)]
 pub struct MetricsArgs {
@@ -78,6 +98,8 @@ pub struct MetricsArgs {
 /// `heliomap worker`.
 #[derive(Debug, Clone, Args)]
 pub struct WorkerArgs {
+    #[command(flatten)]
+    pub webhooks: WebhookArgs,
     #[command(flatten)]
     pub metrics: MetricsArgs,
     #[command(flatten)]
@@ -147,6 +169,46 @@ pub enum KeysCommand {
 
 fn parse_key_id(text: &str) -> Result<KeyId, uuid::Error> {
     text.parse().map(KeyId)
+}
+
+/// `heliomap organisations`.
+#[derive(Debug, Clone, Args)]
+pub struct OrganisationsArgs {
+    #[command(flatten)]
+    pub storage: StorageArgs,
+    #[command(subcommand)]
+    pub command: OrganisationsCommand,
+}
+
+/// What is done about organisations.
+#[derive(Debug, Clone, Subcommand)]
+pub enum OrganisationsCommand {
+    /// List all organisations with what they keep and may keep.
+    List,
+    /// Say what an organisation may keep; what is not given stays as it is.
+    Quota {
+        /// The organisation's name.
+        #[arg(value_name = "NAME")]
+        name: String,
+        /// Bytes of files and models: a size such as 500G, `unlimited`, or `default` for what `--quota-bytes` says.
+        #[arg(long, value_name = "SIZE", value_parser = parse_quota)]
+        bytes: Option<Quota>,
+        /// Plants: a number, `unlimited`, or `default` for what `--quota-plants` says.
+        #[arg(long, value_name = "COUNT", value_parser = parse_quota)]
+        plants: Option<Quota>,
+    },
+}
+
+/// A quota of an organisation; `None` for what holds for all.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Quota(pub Option<u64>);
+
+fn parse_quota(text: &str) -> Result<Quota, String> {
+    match text {
+        "default" => Ok(Quota(None)),
+        "unlimited" => Ok(Quota(Some(UNLIMITED))),
+        text => parse_size(text).map(|size| Quota(Some(size))),
+    }
 }
 
 /// `heliomap openapi`.
@@ -246,6 +308,21 @@ pub struct Limits {
     /// Free space of the data folder's disk that uploads leave to running jobs.
     #[arg(long, env = "HELIOMAP_DISK_RESERVE", default_value = "1G", value_parser = parse_size, value_name = "SIZE")]
     pub disk_reserve: u64,
+    /// Most bytes of files and models that an organisation may keep, unless `heliomap organisations quota` says otherwise of
+    /// it; no bound where it is not given.
+    #[arg(long, env = "HELIOMAP_QUOTA_BYTES", value_parser = parse_size, value_name = "SIZE")]
+    pub quota_bytes: Option<u64>,
+    /// Most plants that an organisation may have, unless `heliomap organisations quota` says otherwise of it; no bound where it
+    /// is not given.
+    #[arg(long, env = "HELIOMAP_QUOTA_PLANTS", value_name = "COUNT")]
+    pub quota_plants: Option<u64>,
+}
+
+impl Limits {
+    /// What every organisation may keep of which nothing else was said.
+    pub fn quotas(&self) -> Quotas {
+        Quotas { bytes: self.quota_bytes, plants: self.quota_plants }
+    }
 }
 
 impl Default for Limits {
@@ -264,6 +341,8 @@ impl Default for Limits {
             max_failed_logins_per_minute: 300,
             max_connections: 1024,
             disk_reserve: 1 << 30,
+            quota_bytes: None,
+            quota_plants: None,
         }
     }
 }
@@ -311,6 +390,14 @@ mod tests {
         {
             assert!(parse_origin(wrong).is_err(), "{wrong}");
         }
+    }
+
+    #[test]
+    fn quotas() {
+        assert_eq!(parse_quota("500G"), Ok(Quota(Some(500 << 30))));
+        assert_eq!(parse_quota("unlimited"), Ok(Quota(Some(UNLIMITED))));
+        assert_eq!(parse_quota("default"), Ok(Quota(None)));
+        assert!(parse_quota("much").is_err());
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! heliomap maps photovoltaic plants from drone overview photos.
 //!
 //! Each room may use what stands before it in this list, never what comes after: `geometry`, `reconstruction`,
-//! `detection`, `layout`, `fusion`, `refinement`, `plant`, `pipeline`; then `store` and `jobs`; then `http`. `overlay`
+//! `detection`, `layout`, `fusion`, `refinement`, `plant`, `pipeline`; then `store`, `jobs` and `webhooks`; then `http`. `overlay`
 //! and `evaluation` look at what the pipeline made; `simulator` makes plants with known truth for tests and benchmarks.
 
 #![allow(clippy::duplicate_mod, reason = "the store's methods are compiled once beside each database")]
@@ -23,3 +23,4 @@ pub mod simulator;
 pub mod store;
 pub mod telemetry;
 pub mod tls;
+pub mod webhooks;

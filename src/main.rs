@@ -3,7 +3,7 @@
 mod commands;
 
 use clap::{Parser, Subcommand};
-use heliomap::config::{KeysArgs, LogArgs, OpenapiArgs, ServeArgs, WorkerArgs};
+use heliomap::config::{KeysArgs, LogArgs, OpenapiArgs, OrganisationsArgs, ServeArgs, WorkerArgs};
 
 /// Maps photovoltaic plants from drone overview photos: every module georeferenced, with its place in the plant.
 #[derive(Debug, Parser)]
@@ -24,6 +24,8 @@ enum Command {
     Worker(WorkerArgs),
     /// Make, list, rotate and revoke keys to the service.
     Keys(KeysArgs),
+    /// List organisations, and say what each may keep.
+    Organisations(OrganisationsArgs),
     /// Map the plant in a folder as OpenSfM leaves it; no server is needed.
     Map(commands::map::MapArgs),
     /// Find the modules in photos and write their boxes.
@@ -43,6 +45,7 @@ fn main() -> anyhow::Result<()> {
         Command::Serve(args) => commands::serve::run(args),
         Command::Worker(args) => commands::worker::run(args),
         Command::Keys(args) => commands::keys::run(args),
+        Command::Organisations(args) => commands::organisations::run(args),
         Command::Map(args) => commands::map::run(&args),
         Command::Detect(args) => commands::detect::run(&args),
         Command::EvaluateDetection(args) => commands::evaluate_detection::run(&args),

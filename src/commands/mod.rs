@@ -6,25 +6,31 @@ pub mod evaluate_detection;
 pub mod keys;
 pub mod map;
 pub mod openapi;
+pub mod organisations;
 pub mod serve;
 pub mod worker;
 
 use anyhow::Context;
-use heliomap::config::{DetectorArgs, JobArgs, Limits, MetricsArgs, StorageArgs};
+use heliomap::config::{DetectorArgs, JobArgs, Limits, MetricsArgs, StorageArgs, WebhookArgs};
 use heliomap::http;
 use heliomap::jobs::{PipelineMapper, Worker, WorkerSettings};
 use heliomap::store::{Blobs, PostgresStore, SqliteStore, Store};
 use heliomap::telemetry::metrics::{self, Metrics, Scrape};
+use heliomap::webhooks::{Sender, SenderSettings};
 use jiff::Timestamp;
 use object_store::aws::AmazonS3Builder;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::net::TcpListener;
 use tokio::sync::Notify;
+use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 
 /// What a crash left among the uploads is deleted after this time.
 const STALE_UPLOADS: Duration = Duration::from_secs(24 * 3600);
+
+/// Messages to webhooks are forgotten so long after they arrived or were given up.
+const OLD_DELIVERIES: Duration = Duration::from_secs(30 * 24 * 3600);
 
 /// How long work in progress may take to end once the process was told to stop.
 const GRACE: Duration = Duration::from_secs(20);
@@ -56,6 +62,7 @@ async fn open_storage(args: &StorageArgs) -> anyhow::Result<(Arc<dyn Store>, Blo
     };
     store.delete_expired_uploads(Timestamp::now()).await?;
     store.forget_old_requests(Timestamp::now()).await?;
+    store.forget_old_deliveries(Timestamp::now() - OLD_DELIVERIES).await?;
     blobs.sweep_uploads(store.uploads().await?.into_iter().collect(), STALE_UPLOADS).await.with_context(hint)?;
     // A plant may have been deleted without its blobs, or while some were still coming.
     for plant in store.deleted_plants().await? {
@@ -83,6 +90,26 @@ fn pipeline_worker(
         metrics,
         bell,
     }
+}
+
+/// Sends messages to webhooks beside what else the process does, until it stops.
+fn send_messages(
+    args: &WebhookArgs,
+    store: &Arc<dyn Store>,
+    metrics: &Metrics,
+    stop: &CancellationToken,
+) -> JoinHandle<()> {
+    let sender = Sender::new(store.clone(), args.targets(), SenderSettings::default(), metrics.clone());
+    let stop = stop.clone();
+    tokio::spawn(async move {
+        match sender {
+            Ok(sender) => sender.run(stop).await,
+            Err(error) => {
+                let cause = std::error::Error::source(&error).map(ToString::to_string).unwrap_or_default();
+                tracing::error!(%error, cause, "no messages are sent to webhooks: install CA certificates on this machine");
+            }
+        }
+    })
 }
 
 /// Serves what the process counts, where that is asked for, until it stops.

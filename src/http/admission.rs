@@ -1,16 +1,18 @@
 //! Whether there is room for an upload, asked before its first byte is taken: the disk keeps a reserve, so that jobs that
-//! run have room for what they write.
+//! run have room for what they write, and the organisation's quota holds.
 
 use super::AppState;
 use super::error::{ApiError, Code};
-use super::guard::refuse;
+use super::guard::{Caller, refuse};
+use super::usage;
 use crate::config::Limits;
 use axum::body::Body;
 use axum::extract::{Request, State};
 use axum::http::{HeaderMap, Method, header};
 use axum::middleware::Next;
-use axum::response::Response;
+use axum::response::{IntoResponse, Response};
 use futures::StreamExt;
+use std::sync::{Arc, OnceLock};
 
 /// How much of an upload comes before the disk is looked at again. Many uploads at once stay within the reserve.
 const LOOK_EVERY_BYTES: u64 = 16 << 20;
@@ -20,11 +22,28 @@ pub async fn admit(State(state): State<AppState>, request: Request, next: Next) 
     if !matches!(*request.method(), Method::PUT | Method::POST | Method::PATCH) {
         return next.run(request).await;
     }
-    if let Err(problem) = room_on_disk(&state, announced(request.headers(), &state.limits)) {
-        return refuse(request, problem).await;
-    }
+    let bytes = announced(request.headers(), &state.limits);
+    // What goes on with an upload was counted when it began.
+    let begins = !request.headers().contains_key("upload-offset");
+    let organisation = request.extensions().get::<Caller>().map(|caller| caller.organisation).filter(|_| begins);
+    let room = match (room_on_disk(&state, bytes), organisation) {
+        (Ok(()), Some(organisation)) => usage::room(&state, organisation, bytes).await,
+        (Ok(()), None) => Ok(None),
+        (Err(problem), _) => Err(problem),
+    };
+    let room = match room {
+        Ok(room) => room,
+        Err(problem) => return refuse(request, problem).await,
+    };
     let (parts, body) = request.into_parts();
-    next.run(Request::from_parts(parts, watched(state, body))).await
+    let refused = Arc::new(OnceLock::new());
+    let body = watched(state, body, room, refused.clone());
+    let response = next.run(Request::from_parts(parts, body)).await;
+    // The handler knows only that no more came.
+    match refused.get() {
+        Some(problem) => ApiError::clone(problem).into_response(),
+        None => response,
+    }
 }
 
 /// How many bytes a request says that it brings: the whole file's where it begins a resumable upload. What is more than
@@ -50,16 +69,26 @@ fn room_on_disk(state: &AppState, bytes: u64) -> Result<(), ApiError> {
     .retry_after(60))
 }
 
-/// A body that counts, and ends with an error where the disk gets full.
-fn watched(state: AppState, body: Body) -> Body {
-    let mut since = 0;
+/// A body that counts, and ends with an error where the disk gets full or there is more than there is room for.
+fn watched(state: AppState, body: Body, room: Option<u64>, refused: Arc<OnceLock<ApiError>>) -> Body {
+    let (mut since, mut sum) = (0, 0);
+    let refuse = move |problem: ApiError| {
+        let error = axum::Error::new(std::io::Error::other(problem.detail.clone()));
+        // The first reason is told.
+        let _ = refused.set(problem);
+        error
+    };
     Body::from_stream(body.into_data_stream().map(move |chunk| {
         let chunk = chunk?;
         state.metrics.upload_bytes.inc_by(chunk.len() as u64);
         since += chunk.len() as u64;
+        sum += chunk.len() as u64;
+        if let Some(room) = room.filter(|room| sum > *room) {
+            return Err(refuse(usage::no_room(room)));
+        }
         if since >= LOOK_EVERY_BYTES {
             since = 0;
-            room_on_disk(&state, 0).map_err(|problem| axum::Error::new(std::io::Error::other(problem.detail)))?;
+            room_on_disk(&state, 0).map_err(&refuse)?;
         }
         Ok::<_, axum::Error>(chunk)
     }))

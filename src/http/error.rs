@@ -48,6 +48,8 @@ codes! {
     ModelNotFound = NOT_FOUND, "model_not_found", "There is no such model";
     KeyNotFound = NOT_FOUND, "key_not_found", "There is no such key";
     UploadNotFound = NOT_FOUND, "upload_not_found", "There is no such upload";
+    WebhookNotFound = NOT_FOUND, "webhook_not_found", "There is no such webhook";
+    DeliveryNotFound = NOT_FOUND, "delivery_not_found", "There is no such message";
     ModuleNotFound = NOT_FOUND, "module_not_found", "There is no such module";
     MethodNotAllowed = METHOD_NOT_ALLOWED, "method_not_allowed", "The method does not apply here";
     Timeout = REQUEST_TIMEOUT, "timeout", "The request took too long";
@@ -55,6 +57,7 @@ codes! {
     SurveyIncomplete = CONFLICT, "survey_incomplete", "The survey cannot be mapped yet";
     JobFinished = CONFLICT, "job_finished", "The job has ended";
     JobStopping = CONFLICT, "job_stopping", "The survey's cancelled job has not stopped yet";
+    TooManyWebhooks = CONFLICT, "too_many_webhooks", "There are as many webhooks as there may be";
     IdempotencyBusy = CONFLICT, "idempotency_busy", "The request is being answered";
     UploadOffset = CONFLICT, "upload_offset", "The bytes do not go on where the upload is";
     TusVersion = PRECONDITION_FAILED, "tus_version", "The protocol's version is missing or another";
@@ -67,6 +70,7 @@ codes! {
     ChecksumMismatch = UNPROCESSABLE_ENTITY, "checksum_mismatch", "The bytes came changed";
     IdempotencyKeyReused = UNPROCESSABLE_ENTITY, "idempotency_key_reused", "The key belongs to another request";
     InvalidName = UNPROCESSABLE_ENTITY, "invalid_name", "The name cannot be used";
+    WebhookUrl = UNPROCESSABLE_ENTITY, "webhook_url", "The webhook's URL cannot be used";
     InvalidFields = UNPROCESSABLE_ENTITY, "invalid_fields", "The document has the wrong fields";
     UnknownFile = UNPROCESSABLE_ENTITY, "unknown_file", "The file is no part of a reconstruction";
     ImageFormatMismatch = UNPROCESSABLE_ENTITY, "image_format_mismatch", "The image is not what its name says";
@@ -80,6 +84,7 @@ codes! {
     TooManyRequests = TOO_MANY_REQUESTS, "too_many_requests", "Too many requests";
     Internal = INTERNAL_SERVER_ERROR, "internal_error", "The service failed";
     Unavailable = SERVICE_UNAVAILABLE, "unavailable", "The service is not ready";
+    QuotaExceeded = INSUFFICIENT_STORAGE, "quota_exceeded", "The organisation may not keep so much";
     StorageFull = INSUFFICIENT_STORAGE, "storage_full", "The service's storage is full";
 }
 
@@ -150,6 +155,7 @@ impl From<StoreError> for ApiError {
     fn from(error: StoreError) -> Self {
         match &error {
             StoreError::Gone { what: "plant" } => Self::new(Code::PlantNotFound, "the plant was deleted meanwhile"),
+            StoreError::OverQuota { what, used, quota } => super::usage::over_quota(what, *used, *quota),
             StoreError::Gone { .. } => Self::new(Code::SurveyNotFound, "the survey was deleted meanwhile"),
             error if error.is_full() => {
                 tracing::error!(%error, "storage is full");

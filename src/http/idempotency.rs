@@ -33,12 +33,15 @@ const KEPT: SignedDuration = SignedDuration::from_hours(24);
 const TAKEN: SignedDuration = SignedDuration::from_mins(2);
 /// Largest answer that is kept.
 const MAX_ANSWER_BYTES: usize = 16 << 20;
-/// Secrets are in the answers of these, and are kept nowhere.
-const SECRET: &str = "/api/v1/keys";
+
+/// Whether the answers of an operation hold a secret, which is kept nowhere.
+fn tells_secret(path: &str) -> bool {
+    path.starts_with("/api/v1/keys") || path == "/api/v1/webhooks"
+}
 
 /// Whether requests to an operation may carry a key.
 fn applies(method: &Method, path: &str) -> bool {
-    matches!(*method, Method::POST | Method::PUT) && !path.starts_with(SECRET)
+    matches!(*method, Method::POST | Method::PUT) && !tells_secret(path)
 }
 
 /// Answers a request that was answered before under its key as before.
@@ -47,7 +50,7 @@ pub async fn once(State(state): State<AppState>, path: MatchedPath, request: Req
     let (Some(organisation), Some(key)) = (caller, request.headers().get(HEADER)) else {
         return next.run(request).await;
     };
-    if path.as_str().starts_with(SECRET) {
+    if tells_secret(path.as_str()) {
         let what = "the answer holds a secret, which is kept nowhere: leave the idempotency-key out";
         return ApiError::new(Code::BadRequest, what).into_response();
     }

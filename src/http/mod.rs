@@ -26,6 +26,8 @@ mod server;
 mod surveys;
 mod tus;
 mod uploads;
+mod usage;
+mod webhooks;
 
 pub use rates::Rates;
 pub use router::{openapi, router};

@@ -33,7 +33,8 @@ impl PageQuery {
         list_limit(self.limit)
     }
 
-    /// The part of a list from the rows asked for; `seq` is a row's sequence number.
+    /// The part of a list from the rows asked for; `seq` is a row's sequence number, `path` where the list is, with what it
+    /// was filtered by.
     pub fn items<R, T>(
         &self,
         path: &str,
@@ -45,7 +46,10 @@ impl PageQuery {
         let more = rows.len() > limit as usize;
         let mut last = None;
         let items = rows.into_iter().take(limit as usize).inspect(|row| last = Some(seq(row))).map(view).collect();
-        let next = last.filter(|_| more).map(|last| format!("{path}?limit={limit}&cursor={last}"));
+        let next = last.filter(|_| more).map(|last| {
+            let mark = if path.contains('?') { '&' } else { '?' };
+            format!("{path}{mark}limit={limit}&cursor={last}")
+        });
         Ok(List { items, next })
     }
 }

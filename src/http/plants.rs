@@ -66,7 +66,9 @@ pub fn created_answer<T: Serialize>(location: String, new: bool, view: T) -> Res
         (status = 201, description = "Created", body = PlantView, headers(("location" = String))),
         (status = 200, description = "A plant of that name was there", body = PlantView, headers(("location" = String))),
         (status = "4XX", description = "`invalid_json`, `invalid_fields`, `invalid_name`, `unsupported_media_type`, `too_large`",
-            body = Problem, content_type = "application/problem+json")
+            body = Problem, content_type = "application/problem+json"),
+        (status = 507, description = "`quota_exceeded`: the organisation has as many plants as it may", body = Problem,
+            content_type = "application/problem+json")
     )
 )]
 pub async fn create(
@@ -76,7 +78,8 @@ pub async fn create(
 ) -> Result<Response, ApiError> {
     caller.require_all_plants()?;
     let name = checked_name(&new.name)?;
-    let (plant, new) = match state.store.create_plant(caller.organisation, name, Timestamp::now()).await? {
+    let quotas = state.limits.quotas();
+    let (plant, new) = match state.store.create_plant(caller.organisation, name, quotas, Timestamp::now()).await? {
         Created::New(plant) => (plant, true),
         Created::Existing(plant) => (plant, false),
     };

@@ -3,7 +3,7 @@
 use super::guard::{Gate, Policy};
 use super::{
     AppState, admission, conditional, docs, error, events, features, guard, health, idempotency, images, jobs, keys,
-    models, page, plants, surveys, tus, uploads,
+    models, page, plants, surveys, tus, uploads, usage, webhooks,
 };
 use crate::config::NetworkArgs;
 use crate::telemetry::Metrics;
@@ -48,6 +48,7 @@ const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
         (name = "surveys", description = "Flights over a plant: photos and their reconstruction."),
         (name = "jobs", description = "Mappings of a survey."),
         (name = "models", description = "What was found: modules, sectors, benches and lines as GeoJSON."),
+        (name = "webhooks", description = "Who is told of the ends of jobs."),
         (name = "access", description = "Keys, and what was done with them."),
         (name = "operation", description = "Whether the service runs, and what it offers.")
     )
@@ -76,6 +77,11 @@ fn prompt() -> OpenApiRouter<AppState> {
         .routes(routes!(keys::get, keys::revoke))
         .routes(routes!(keys::rotate))
         .routes(routes!(keys::audit))
+        .routes(routes!(webhooks::create, webhooks::list))
+        .routes(routes!(webhooks::get, webhooks::delete))
+        .routes(routes!(webhooks::deliveries))
+        .routes(routes!(webhooks::resend))
+        .routes(routes!(usage::get))
         .routes(routes!(health::health))
         .routes(routes!(health::ready))
         .routes(routes!(docs::openapi_yaml))

@@ -7,6 +7,7 @@ use crate::config::{Limits, NetworkArgs};
 use crate::plant::PlantId;
 use crate::store::{Blobs, Plant, Store, Survey, SurveyId};
 use crate::telemetry::Metrics;
+use crate::webhooks::Targets;
 use std::sync::Arc;
 use tokio::sync::{Notify, Semaphore};
 use tokio_util::sync::CancellationToken;
@@ -27,6 +28,8 @@ pub struct AppState {
     pub bell: Arc<Notify>,
     /// Raised when the service stops: answers without an end end then.
     pub stop: CancellationToken,
+    /// Where webhooks may lead.
+    pub targets: Targets,
     /// Whether anyone may do anything, without a key.
     pub insecure: bool,
 }
@@ -51,6 +54,7 @@ impl AppState {
             decoding: decoders(),
             bell: Arc::default(),
             stop: CancellationToken::new(),
+            targets: Targets::Public,
             insecure: false,
         }
     }

@@ -280,7 +280,7 @@ pub async fn options(State(state): State<AppState>, _place: ApiPath<(PlantId, Su
         (status = "4XX", description = "`plant_not_found`, `survey_not_found`, `upload_not_found` (a part), `tus_version`, \
             `bad_request`, `invalid_name`, `unknown_file`, `too_large`; a file put together: as `PUT` of that file",
             body = Problem, content_type = "application/problem+json"),
-        (status = 507, description = "`storage_full`", body = Problem, content_type = "application/problem+json")
+        (status = 507, description = "`storage_full`, `quota_exceeded`", body = Problem, content_type = "application/problem+json")
     )
 )]
 pub async fn create(
@@ -499,7 +499,7 @@ pub async fn get(
             `upload_busy`, `upload_interrupted`, `upload_stalled`, `tus_version`, `bad_request`, `too_large`, \
             `unsupported_media_type`; after the last byte: as `PUT` of the file",
             body = Problem, content_type = "application/problem+json"),
-        (status = 507, description = "`storage_full`", body = Problem, content_type = "application/problem+json")
+        (status = 507, description = "`storage_full`, `quota_exceeded`", body = Problem, content_type = "application/problem+json")
     )
 )]
 pub async fn patch(

@@ -75,7 +75,7 @@ pub fn uploaded(stored: Stored) -> UploadedFile {
         (status = "4XX", description = "`plant_not_found`, `survey_not_found`, `invalid_name`, `too_large`, `image_too_large`, \
             `image_format_mismatch`, `image_unreadable`, `image_truncated`, `upload_interrupted`, `upload_stalled`, \
             `bad_request`, `checksum_mismatch`", body = Problem, content_type = "application/problem+json"),
-        (status = 507, description = "`storage_full`", body = Problem, content_type = "application/problem+json")
+        (status = 507, description = "`storage_full`, `quota_exceeded`", body = Problem, content_type = "application/problem+json")
     )
 )]
 pub async fn put_image(
@@ -112,7 +112,7 @@ pub async fn put_image(
         (status = "4XX", description = "`plant_not_found`, `survey_not_found`, `unknown_file`, `invalid_name`, `too_large`, \
             `file_unreadable`, `image_too_large`, `image_format_mismatch`, `image_unreadable`, `image_truncated`, \
             `upload_interrupted`, `upload_stalled`, `bad_request`, `checksum_mismatch`", body = Problem, content_type = "application/problem+json"),
-        (status = 507, description = "`storage_full`", body = Problem, content_type = "application/problem+json")
+        (status = 507, description = "`storage_full`, `quota_exceeded`", body = Problem, content_type = "application/problem+json")
     )
 )]
 pub async fn put_reconstruction_file(
@@ -197,7 +197,7 @@ async fn receive_body(
         (status = "4XX", description = "`plant_not_found`, `survey_not_found`, `files_refused`, `bad_request`, \
             `upload_interrupted`, `upload_stalled`, `unsupported_media_type`, `too_large`", body = Problem,
             content_type = "application/problem+json"),
-        (status = 507, description = "`storage_full`", body = Problem, content_type = "application/problem+json")
+        (status = 507, description = "`storage_full`, `quota_exceeded`", body = Problem, content_type = "application/problem+json")
     )
 )]
 pub async fn post_images(
@@ -299,7 +299,7 @@ struct PhotoForm {
             `archive_unreadable`, `archive_empty`, `archive_too_large`, `too_large`, `invalid_name`, `file_unreadable`, \
             `image_too_large`, `image_format_mismatch`, `image_unreadable`, `image_truncated`, `upload_interrupted`, \
             `upload_stalled`, `bad_request`, `checksum_mismatch`", body = Problem, content_type = "application/problem+json"),
-        (status = 507, description = "`storage_full`", body = Problem, content_type = "application/problem+json")
+        (status = 507, description = "`storage_full`, `quota_exceeded`", body = Problem, content_type = "application/problem+json")
     )
 )]
 pub async fn put_reconstruction(
@@ -335,7 +335,7 @@ pub async fn put_reconstruction(
     responses(
         (status = 200, description = "All stored", body = UploadedArchive),
         (status = "4XX", description = "As `PUT`", body = Problem, content_type = "application/problem+json"),
-        (status = 507, description = "`storage_full`", body = Problem, content_type = "application/problem+json")
+        (status = 507, description = "`storage_full`, `quota_exceeded`", body = Problem, content_type = "application/problem+json")
     )
 )]
 pub async fn post_reconstruction(

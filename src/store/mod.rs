@@ -13,6 +13,8 @@ pub mod secret;
 pub mod sqlite;
 pub mod survey_path;
 pub mod uploads;
+pub mod usage;
+pub mod webhooks;
 
 mod sql;
 
@@ -31,6 +33,11 @@ pub use sqlite::SqliteStore;
 pub use survey_path::{Content, FileKind, ImageName, InvalidPath, SurveyPath};
 
 pub use uploads::{Upload, UploadId, UploadStore};
+pub use usage::{Quotas, Usage, UsageStore};
+pub use webhooks::{
+    Delivery, DeliveryClaim, DeliveryId, DeliveryState, NewWebhook, Sent, SigningSecret, Webhook, WebhookId,
+    WebhookStore,
+};
 
 use crate::plant::{Layer, ModuleId, PlantId};
 use jiff::Timestamp;
@@ -42,6 +49,9 @@ pub enum StoreError {
     /// The row that a new row belongs to was deleted meanwhile.
     #[error("the {what} is gone")]
     Gone { what: &'static str },
+    /// The organisation may not keep so much.
+    #[error("the organisation keeps {used} of the {quota} {what} that it may keep")]
+    OverQuota { what: &'static str, used: u64, quota: u64 },
     /// The database failed.
     #[error("database: {0}")]
     Database(#[from] sqlx::Error),
@@ -78,15 +88,17 @@ impl StoreError {
 
 /// The rows. Absence is `Ok(None)`; the time comes in from the caller.
 #[async_trait::async_trait]
-pub trait Store: AccessStore + UploadStore + RequestStore {
+pub trait Store: AccessStore + UploadStore + RequestStore + WebhookStore + UsageStore {
     /// Fails where the database does not answer.
     async fn ping(&self) -> Result<(), StoreError>;
 
-    /// Creates an organisation's plant, or finds the one of that name.
+    /// Creates an organisation's plant, or finds the one of that name. [`StoreError::OverQuota`] where it has as many as it
+    /// may; `defaults` holds for what was not said of the organisation alone.
     async fn create_plant(
         &self,
         organisation: OrganisationId,
         name: &str,
+        defaults: Quotas,
         now: Timestamp,
     ) -> Result<Created<Plant>, StoreError>;
     /// One plant, whoever owns it.

@@ -27,6 +27,16 @@ macro_rules! job {
          error_message, attempt, max_attempts, fence, cancel_requested, model_version, created_ms, started_ms, finished_ms"
     };
 }
+macro_rules! webhook {
+    () => {
+        "seq, id, organisation_id, plant_id, url, created_ms"
+    };
+}
+macro_rules! delivery {
+    () => {
+        "seq, id, webhook_id, job_id, state, attempts, attempts_left, run_after_ms, error, created_ms, finished_ms"
+    };
+}
 macro_rules! model {
     () => {
         "seq, plant_id, version, survey_id, job_id, sha256, size, warnings, created_ms"
@@ -39,6 +49,31 @@ pub const CREATE_ORGANISATION: &str = "\
     INSERT INTO organisations (id, name, created_ms) VALUES ($1, $2, $3) ON CONFLICT (name) DO NOTHING \
     RETURNING id, name, created_ms";
 pub const ORGANISATION_BY_NAME: &str = "SELECT id, name, created_ms FROM organisations WHERE name = $1";
+
+macro_rules! usage {
+    () => {
+        "SELECT id, name, created_ms, max_bytes, max_plants, \
+         (SELECT COUNT(*) FROM plants WHERE plants.organisation_id = organisations.id) AS plants, \
+         (SELECT CAST(COALESCE(SUM(plants.bytes), 0) AS BIGINT) FROM plants \
+         WHERE plants.organisation_id = organisations.id) AS bytes, \
+         (SELECT CAST(COALESCE(SUM(uploads.length), 0) AS BIGINT) FROM uploads \
+         JOIN surveys ON surveys.id = uploads.survey_id JOIN plants ON plants.id = surveys.plant_id \
+         WHERE plants.organisation_id = organisations.id AND uploads.outcome IS NULL AND uploads.expires_ms > $1) \
+         AS announced_bytes FROM organisations"
+    };
+}
+pub const ORGANISATIONS: &str = concat!(usage!(), " ORDER BY name");
+pub const USAGE: &str = concat!(usage!(), " WHERE id = $2");
+pub const SET_QUOTAS: &str = "UPDATE organisations SET max_bytes = $2, max_plants = $3 WHERE id = $1";
+/// Changes nothing, and keeps others waiting until the transaction ends.
+pub const LOCK_QUOTAS: &str = "UPDATE organisations SET name = name WHERE id = $1 RETURNING max_bytes, max_plants";
+pub const OWNER: &str = "SELECT organisation_id FROM plants WHERE id = $1";
+pub const BYTES_OF_ORGANISATION: &str =
+    "SELECT CAST(COALESCE(SUM(bytes), 0) AS BIGINT) FROM plants WHERE organisation_id = $1";
+pub const PLANTS_OF_ORGANISATION: &str = "SELECT COUNT(*) FROM plants WHERE organisation_id = $1";
+pub const KEEP_BLOB: &str =
+    "INSERT INTO blobs (plant_id, sha256, size) VALUES ($1, $2, $3) ON CONFLICT (plant_id, sha256) DO NOTHING";
+pub const COUNT_BYTES: &str = "UPDATE plants SET bytes = bytes + $2 WHERE id = $1";
 
 pub const CREATE_KEY: &str = concat!(
     "INSERT INTO api_keys (id, organisation_id, name, prefix, sha256, scopes, plants, created_ms, expires_ms) \
@@ -154,6 +189,49 @@ pub const KEEP_ANSWER: &str = "\
 pub const FORGET_REQUEST: &str = "DELETE FROM requests WHERE organisation_id = $1 AND name = $2 AND status IS NULL";
 pub const FORGET_OLD_REQUESTS: &str = "DELETE FROM requests WHERE expires_ms <= $1";
 
+pub const COUNT_WEBHOOKS: &str = "SELECT COUNT(*) FROM webhooks WHERE organisation_id = $1";
+pub const CREATE_WEBHOOK: &str = concat!(
+    "INSERT INTO webhooks (id, organisation_id, plant_id, url, secret, created_ms) VALUES ($1, $2, $3, $4, $5, $6) \
+     RETURNING ",
+    webhook!()
+);
+pub const WEBHOOK: &str = concat!("SELECT ", webhook!(), " FROM webhooks WHERE organisation_id = $1 AND id = $2");
+pub const WEBHOOKS: &str =
+    concat!("SELECT ", webhook!(), " FROM webhooks WHERE organisation_id = $1 AND seq > $2 ORDER BY seq LIMIT $3");
+pub const DELETE_WEBHOOK: &str = "DELETE FROM webhooks WHERE organisation_id = $1 AND id = $2";
+pub const WEBHOOKS_OF_JOB: &str = "\
+    SELECT webhooks.id FROM jobs JOIN plants ON plants.id = jobs.plant_id \
+    JOIN webhooks ON webhooks.organisation_id = plants.organisation_id \
+    WHERE jobs.id = $1 AND COALESCE(webhooks.plant_id, plants.id) = plants.id ORDER BY webhooks.seq";
+pub const CREATE_DELIVERY: &str = "\
+    INSERT INTO deliveries (id, webhook_id, job_id, state, attempts_left, run_after_ms, created_ms) \
+    VALUES ($1, $2, $3, 'waiting', $4, $5, $5)";
+pub const DELIVERIES: &str = concat!(
+    "SELECT ",
+    delivery!(),
+    " FROM deliveries WHERE webhook_id = $1 AND state = COALESCE($2, state) AND seq < $3 ORDER BY seq DESC LIMIT $4"
+);
+pub const RESEND_DELIVERY: &str = concat!(
+    "UPDATE deliveries SET state = 'waiting', attempts_left = $4, run_after_ms = $3, finished_ms = NULL \
+     WHERE webhook_id = $1 AND id = $2 RETURNING ",
+    delivery!()
+);
+pub const DELIVERY_DUE: &str = "SELECT 1 FROM deliveries WHERE state = 'waiting' AND run_after_ms <= $1 LIMIT 1";
+/// The condition stands twice: a second process that waited for the first one's row looks at it again.
+pub const CLAIM_DELIVERY: &str = concat!(
+    "UPDATE deliveries SET attempts = attempts + 1, attempts_left = attempts_left - 1, run_after_ms = $2 \
+     WHERE state = 'waiting' AND run_after_ms <= $1 AND seq = (SELECT due.seq FROM deliveries AS due \
+     WHERE due.state = 'waiting' AND due.run_after_ms <= $1 ORDER BY due.run_after_ms, due.seq LIMIT 1) RETURNING ",
+    delivery!()
+);
+pub const WEBHOOK_OF_DELIVERY: &str = "SELECT url, secret FROM webhooks WHERE id = $1";
+pub const JOB_OF_DELIVERY: &str = concat!("SELECT ", job!(), " FROM jobs WHERE id = $1");
+/// `$2` the attempt, `$3` the state, `$4` what failed, `$5` the time from which to try again, `$6` the time of the end.
+pub const END_DELIVERY: &str = "\
+    UPDATE deliveries SET state = $3, error = $4, run_after_ms = COALESCE($5, run_after_ms), finished_ms = $6 \
+    WHERE id = $1 AND attempts = $2 AND state = 'waiting'";
+pub const FORGET_OLD_DELIVERIES: &str = "DELETE FROM deliveries WHERE finished_ms < $1";
+
 pub const ENQUEUE_JOB: &str = concat!(
     "INSERT INTO jobs (id, plant_id, survey_id, state, options, max_attempts, run_after_ms, created_ms, priority) \
      VALUES ($1, $2, $3, 'queued', $4, $5, $6, $6, $7) \
@@ -188,7 +266,8 @@ pub const BURY_ABANDONED_JOBS: &str = "\
     error_code = CASE WHEN cancel_requested THEN error_code ELSE 'worker_lost' END, \
     error_message = CASE WHEN cancel_requested THEN error_message ELSE $2 END, \
     state = CASE WHEN cancel_requested THEN 'cancelled' ELSE 'failed' END \
-    WHERE state = 'running' AND lease_until_ms < $1 AND (cancel_requested OR attempt - attempts_before >= max_attempts)";
+    WHERE state = 'running' AND lease_until_ms < $1 AND (cancel_requested OR attempt - attempts_before >= max_attempts) \
+    RETURNING id";
 pub const CLAIM_JOB: &str = concat!(
     "UPDATE jobs SET state = 'running', worker = $1, attempt = attempt + 1, fence = fence + 1, lease_until_ms = $3, \
      started_ms = COALESCE(started_ms, $2), stage = NULL, done = 0, total = 0, remaining_ms = NULL \

@@ -69,6 +69,8 @@ pub struct Metrics {
     /// Attempts at jobs, by how they ended.
     pub attempts: Family<OutcomeLabels, Counter>,
     pub stage_seconds: Family<StageLabels, Histogram, fn() -> Histogram>,
+    /// Messages to webhooks, by what became of them.
+    pub deliveries: Family<OutcomeLabels, Counter>,
     jobs: Family<StateLabels, Gauge>,
     queue_depth: Gauge,
     queue_age_seconds: Seconds,
@@ -88,6 +90,7 @@ impl Default for Metrics {
             upload_bytes: Counter::default(),
             attempts: Family::default(),
             stage_seconds: Family::new_with_constructor(works),
+            deliveries: Family::default(),
             jobs: Family::default(),
             queue_depth: Gauge::default(),
             queue_age_seconds: Gauge::default(),
@@ -112,6 +115,8 @@ impl Default for Metrics {
             Unit::Seconds,
             metrics.stage_seconds.clone(),
         );
+        let deliveries = metrics.deliveries.clone();
+        registry.register("webhook_deliveries", "Messages sent to webhooks by what became of them", deliveries);
         registry.register("jobs", "Jobs by state, whoever's and whichever process's", metrics.jobs.clone());
         registry.register("queue_depth", "Jobs that wait for a worker", metrics.queue_depth.clone());
         registry.register_with_unit(

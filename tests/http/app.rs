@@ -12,6 +12,7 @@ use heliomap::plant::{
 };
 use heliomap::store::{Blobs, Created, NewKey, Scope, Secret, SqliteStore, Store};
 use heliomap::telemetry::Metrics;
+use heliomap::webhooks::Targets;
 use nalgebra::Vector3;
 use reqwest::{Client, Method, RequestBuilder, Response, StatusCode};
 use serde_json::{Value, json};
@@ -272,6 +273,11 @@ impl App {
         base
     }
 
+    /// Where it keeps bytes.
+    pub fn blobs(&self) -> Blobs {
+        self.blobs.clone()
+    }
+
     /// Tells the service to stop.
     pub fn stop(&self) {
         self.cancelled.cancel();
@@ -354,6 +360,7 @@ impl App {
             metrics: metrics.clone(),
             insecure,
             stop: cancelled.clone(),
+            targets: Targets::Any,
             ..AppState::new(store.clone(), blobs.clone(), limits)
         };
         let (app, closing) = (router(state), cancelled.clone());

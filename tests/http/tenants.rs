@@ -47,7 +47,10 @@ fn filled(template: &str, parameters: &BTreeMap<&str, String>) -> String {
 /// Everything that an organisation may own, and what its objects are called.
 async fn world(app: &App) -> BTreeMap<&'static str, String> {
     let survey = app.complete_survey().await;
+    let (_, webhook) = app.post("/api/v1/webhooks", json!({"url": "https://example.org/"})).await;
+    let webhook = webhook["id"].as_str().unwrap().to_owned();
     let job = app.map(&survey).await;
+    let (_, deliveries) = app.get(&format!("/api/v1/webhooks/{webhook}/deliveries")).await;
     let plant = plant_path(&survey);
     let (_, modules) = app.get(&format!("{plant}/models/latest/modules")).await;
     let (_, keys) = app.get("/api/v1/keys").await;
@@ -63,6 +66,8 @@ async fn world(app: &App) -> BTreeMap<&'static str, String> {
         ("job", job["id"].as_str().unwrap().to_owned()),
         ("module", modules["features"][0]["id"].as_str().unwrap().to_owned()),
         ("key", keys["items"][0]["id"].as_str().unwrap().to_owned()),
+        ("webhook", webhook),
+        ("delivery", deliveries["items"][0]["id"].as_str().unwrap().to_owned()),
         ("version", "1".to_owned()),
         ("layer", "modules".to_owned()),
         ("name", "a.jpg".to_owned()),
@@ -169,7 +174,7 @@ async fn a_key_for_one_plant_sees_no_other_and_makes_no_keys() {
             assert!(status.is_client_error() && status != StatusCode::CONFLICT, "{template}: {answer}");
         }
     }
-    for path in ["/api/v1/keys", "/api/v1/audit"] {
+    for path in ["/api/v1/keys", "/api/v1/audit", "/api/v1/webhooks"] {
         assert_eq!(app.get(path).await.0, StatusCode::FORBIDDEN);
     }
     let ask = json!({"name": "more", "scopes": ["admin"]});

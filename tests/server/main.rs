@@ -197,6 +197,7 @@ fn logs_name_requests_and_jobs_and_hold_no_secret() {
     let mut child = Command::new(env!("CARGO_BIN_EXE_heliomap"))
         .args(["serve", "--insecure", "--listen", "127.0.0.1:0", "--log", "trace", "--log-format", "json"])
         .env("HELIOMAP_DATA_DIR", data.path())
+        .env("HELIOMAP_WEBHOOK_PRIVATE_TARGETS", "true")
         .stdout(Stdio::piped())
         .stderr(std::fs::File::create(data.path().join("log")).unwrap())
         .spawn()
@@ -211,14 +212,23 @@ fn logs_name_requests_and_jobs_and_hold_no_secret() {
     assert_eq!(request.header("cookie", password).send().unwrap().status(), StatusCode::OK);
     let key = json!({"name": "first", "scopes": ["read"]});
     let key: Value = client.post(format!("{base}/api/v1/keys")).json(&key).send().unwrap().json().unwrap();
+    let hook = json!({"url": "http://127.0.0.1:9/pa55w0rd?token=pa55w0rd"});
+    let hook: Value = client.post(format!("{base}/api/v1/webhooks")).json(&hook).send().unwrap().json().unwrap();
     let (_, job) = broken_survey_with_job(&client, base);
     follow(&client, base, &job);
+    let deliveries = format!("{base}/api/v1/webhooks/{}/deliveries", hook["id"].as_str().unwrap());
+    let begun = Instant::now();
+    while client.get(&deliveries).send().unwrap().json::<Value>().unwrap()["items"][0]["error"].is_null() {
+        assert!(begun.elapsed() < Duration::from_secs(30), "no message is tried");
+        std::thread::sleep(Duration::from_millis(50));
+    }
     assert!(program.terminate().success());
     let log = std::fs::read_to_string(data.path().join("log")).unwrap();
     let lines: Vec<Value> = log.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     assert!(lines.iter().any(|line| line["span"]["id"] == "call-7" && line["status"] == 200), "{log}");
     assert!(lines.iter().any(|line| line["span"]["job"] == job["id"]), "{log}");
-    for secret in [secret, password, &key["secret"].as_str().unwrap()[11..]] {
+    let made = [&key["secret"].as_str().unwrap()[11..], hook["secret"].as_str().unwrap()];
+    for secret in [secret, password].into_iter().chain(made) {
         assert!(!log.contains(secret), "the log holds {secret}");
     }
 

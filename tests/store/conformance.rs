@@ -3,11 +3,12 @@
 use heliomap::plant::{Layer, ModuleId, PlantId, Warning};
 use heliomap::reconstruction::PhotoFacts;
 use heliomap::store::requests::{Begun, KeptAnswer};
+use heliomap::store::usage::UNLIMITED;
 use heliomap::store::{
-    AuditEntry, Cancelled, Checkpoint, Claim, Completed, Created, Digest, Ending, Enqueued, FeatureQuery, FileRecord,
-    FileWritten, GeoBox, Heartbeat, Job, JobRequest, JobState, KeyId, NewFeature, NewKey, NewLayer, NewModel,
-    OrganisationId, Page, Plant, Progress, Scope, SecretRecord, Store, StoreError, Survey, SurveyId, SurveyPath,
-    Upload, UploadId,
+    AuditEntry, Cancelled, Checkpoint, Claim, Completed, Created, DeliveryState, Digest, Ending, Enqueued,
+    FeatureQuery, FileRecord, FileWritten, GeoBox, Heartbeat, Job, JobId, JobRequest, JobState, KeyId, NewFeature,
+    NewKey, NewLayer, NewModel, NewWebhook, OrganisationId, Page, Plant, Progress, Quotas, Scope, SecretRecord, Sent,
+    SigningSecret, Store, StoreError, Survey, SurveyId, SurveyPath, Upload, UploadId, Usage, Webhook, WebhookId,
 };
 use jiff::Timestamp;
 use std::time::Duration;
@@ -22,7 +23,7 @@ fn at(seconds: i64) -> Timestamp {
 }
 
 async fn plant(store: &dyn Store, name: &str) -> Plant {
-    match store.create_plant(ORGANISATION, name, at(0)).await.unwrap() {
+    match store.create_plant(ORGANISATION, name, Quotas::default(), at(0)).await.unwrap() {
         Created::New(plant) | Created::Existing(plant) => plant,
     }
 }
@@ -86,7 +87,7 @@ pub async fn plants_and_surveys(store: &dyn Store) {
     let a = plant(store, "A").await;
     let b = plant(store, "B").await;
     assert!(
-        matches!(store.create_plant(ORGANISATION, "A", at(9)).await.unwrap(), Created::Existing(found) if found.id == a.id)
+        matches!(store.create_plant(ORGANISATION, "A", Quotas::default(), at(9)).await.unwrap(), Created::Existing(found) if found.id == a.id)
     );
     assert_eq!(store.plant(b.id).await.unwrap().unwrap().name, "B");
     assert!(store.plant(PlantId(Uuid::nil())).await.unwrap().is_none());
@@ -391,11 +392,15 @@ pub async fn organisations_and_their_plants(store: &dyn Store) {
     assert_eq!(organisation(store, "default").await, ORGANISATION);
     let (a, b) = (organisation(store, "A").await, organisation(store, "B").await);
     assert_eq!(organisation(store, "A").await, a);
-    let Created::New(one) = store.create_plant(a, "Sunfield", at(1)).await.unwrap() else { panic!("it is new") };
-    let Created::New(two) = store.create_plant(b, "Sunfield", at(1)).await.unwrap() else {
+    let Created::New(one) = store.create_plant(a, "Sunfield", Quotas::default(), at(1)).await.unwrap() else {
+        panic!("it is new")
+    };
+    let Created::New(two) = store.create_plant(b, "Sunfield", Quotas::default(), at(1)).await.unwrap() else {
         panic!("names are its own")
     };
-    let Created::New(more) = store.create_plant(a, "Hill", at(2)).await.unwrap() else { panic!("it is new") };
+    let Created::New(more) = store.create_plant(a, "Hill", Quotas::default(), at(2)).await.unwrap() else {
+        panic!("it is new")
+    };
     let ids = async |organisation, only: Option<&[PlantId]>| -> Vec<PlantId> {
         store.plants(organisation, only, ALL).await.unwrap().iter().map(|plant| plant.id).collect()
     };
@@ -404,7 +409,7 @@ pub async fn organisations_and_their_plants(store: &dyn Store) {
     assert_eq!(ids(a, Some(&[more.id, two.id])).await, [more.id]);
     assert!(ids(a, Some(&[])).await.is_empty());
     assert_eq!(store.plant(two.id).await.unwrap().unwrap().organisation, b);
-    let nobody = store.create_plant(OrganisationId(Uuid::max()), "x", at(3)).await;
+    let nobody = store.create_plant(OrganisationId(Uuid::max()), "x", Quotas::default(), at(3)).await;
     assert!(matches!(nobody, Err(StoreError::Gone { what: "organisation" })));
 }
 
@@ -590,4 +595,200 @@ pub async fn named_requests(store: &dyn Store) {
     assert_eq!(begin(b, 1).await, Begun::New);
     store.forget_old_requests(at(1000)).await.unwrap();
     assert_eq!(begin(a, 999).await, Begun::New);
+}
+
+async fn webhook(store: &dyn Store, organisation: OrganisationId, plant: Option<PlantId>) -> Webhook {
+    let secret = SigningSecret::given("0123456789abcdef").unwrap();
+    let new = NewWebhook { organisation, plant, url: "https://example.org/".to_owned(), secret };
+    store.create_webhook(&new, at(0)).await.unwrap().unwrap()
+}
+
+async fn messages(store: &dyn Store, webhook: &Webhook) -> Vec<(JobId, DeliveryState)> {
+    let found = store.deliveries(webhook.id, None, ALL).await.unwrap();
+    found.into_iter().map(|delivery| (delivery.job, delivery.state)).collect()
+}
+
+pub async fn webhooks(store: &dyn Store) {
+    let Created::New(other) = store.create_organisation("other", at(0)).await.unwrap() else {
+        panic!("there is no such organisation yet");
+    };
+    let (a, b) = (plant(store, "A").await, plant(store, "B").await);
+    let all = webhook(store, ORGANISATION, None).await;
+    let of_a = webhook(store, ORGANISATION, Some(a.id)).await;
+    let strange = webhook(store, other.id, None).await;
+    let of_nothing = NewWebhook {
+        organisation: ORGANISATION,
+        plant: Some(PlantId(Uuid::nil())),
+        url: String::new(),
+        secret: SigningSecret::random().unwrap(),
+    };
+    let nowhere = store.create_webhook(&of_nothing, at(0)).await;
+    assert!(matches!(nowhere, Err(StoreError::Gone { what: "plant" })));
+    let listed = store.webhooks(ORGANISATION, ALL).await.unwrap();
+    assert_eq!(listed.iter().map(|webhook| webhook.id).collect::<Vec<_>>(), [all.id, of_a.id]);
+    assert_eq!(listed[1].plant, Some(a.id));
+    assert!(store.webhook(other.id, all.id).await.unwrap().is_none());
+    assert!(!store.delete_webhook(other.id, all.id).await.unwrap());
+
+    // Every end is told once, whatever it is; what goes back to the queue is none.
+    let (june, july) = (survey(store, a.id, "June").await, survey(store, b.id, "July").await);
+    let mut ended = Vec::new();
+    for ending in 0..5 {
+        let job = enqueue(store, &june).await;
+        if ending == 0 {
+            store.cancel_job(a.id, job.id, at(1)).await.unwrap();
+        } else {
+            let claimed = claim(store, 1).await.unwrap();
+            let failed = Ending::Failed { code: "code".to_owned(), message: "message".to_owned() };
+            match ending {
+                1 => assert!(store.end_job(&claimed, &failed, at(1)).await.unwrap()),
+                2 => assert!(store.end_job(&claimed, &Ending::Cancelled, at(1)).await.unwrap()),
+                3 => {
+                    let done = store.complete_job(&claimed, &model(a.id, 1, 1), at(1)).await.unwrap();
+                    assert!(matches!(done, Completed::Done(_)));
+                }
+                _ => {
+                    let retry = Ending::Retry { code: "code".to_owned(), message: "message".to_owned(), at: at(2) };
+                    assert!(store.end_job(&claimed, &retry, at(1)).await.unwrap());
+                    assert_eq!(messages(store, &of_a).await.len(), ended.len());
+                    // Its last attempt, whose worker falls silent.
+                    claim(store, 2).await.unwrap();
+                    assert!(claim(store, 100).await.is_none());
+                }
+            }
+        }
+        ended.insert(0, (job.id, DeliveryState::Waiting));
+        assert_eq!(messages(store, &of_a).await, ended, "after {ending}");
+    }
+    let of_b = enqueue(store, &july).await;
+    store.cancel_job(b.id, of_b.id, at(100)).await.unwrap();
+    assert_eq!(messages(store, &of_a).await, ended);
+    assert_eq!(messages(store, &all).await.len(), 6);
+    assert!(messages(store, &strange).await.is_empty());
+
+    assert!(store.delete_plant(a.id, at(101)).await.unwrap());
+    assert_eq!(messages(store, &all).await, [(of_b.id, DeliveryState::Waiting)]);
+    assert!(store.webhook(ORGANISATION, of_a.id).await.unwrap().is_none());
+    assert!(store.delete_webhook(ORGANISATION, all.id).await.unwrap());
+    assert!(messages(store, &all).await.is_empty());
+
+    for _ in 0..100 {
+        webhook(store, ORGANISATION, None).await;
+    }
+    let secret = SigningSecret::random().unwrap();
+    let more = NewWebhook { organisation: ORGANISATION, plant: None, url: String::new(), secret };
+    assert!(store.create_webhook(&more, at(0)).await.unwrap().is_none());
+}
+
+pub async fn messages_are_sent_by_one_at_a_time_and_not_for_ever(store: &dyn Store) {
+    let survey = survey(store, plant(store, "A").await.id, "June").await;
+    let webhook = webhook(store, ORGANISATION, None).await;
+    let job = enqueue(store, &survey).await;
+    assert!(store.claim_delivery(LEASE, at(1)).await.unwrap().is_none());
+    store.cancel_job(survey.plant, job.id, at(1)).await.unwrap();
+    let take = async |now| store.claim_delivery(LEASE, at(now)).await.unwrap();
+    let first = take(1).await.unwrap();
+    assert_eq!(
+        (first.job.id, first.url.as_str(), first.secret.reveal()),
+        (job.id, "https://example.org/", "0123456789abcdef")
+    );
+    assert!(take(30).await.is_none());
+    // Whoever had it is taken for dead.
+    let mut taken = take(31).await.unwrap();
+    assert!(!store.end_delivery(&first, &Sent::Arrived, at(31)).await.unwrap());
+    let failed = |seconds| Sent::Failed { error: "refused".to_owned(), at: at(seconds) };
+    let mut now = 31;
+    for attempts in 2..=8 {
+        assert_eq!((taken.delivery.attempts, taken.delivery.attempts_left), (attempts, 8 - attempts));
+        assert!(store.end_delivery(&taken, &failed(now + 10), at(now)).await.unwrap());
+        now += 10;
+        if attempts < 8 {
+            assert!(take(now - 1).await.is_none());
+            taken = take(now).await.unwrap();
+        }
+    }
+    assert!(take(100_000).await.is_none());
+    let dead = store.deliveries(webhook.id, Some(DeliveryState::Dead), ALL).await.unwrap();
+    assert_eq!((dead.len(), dead[0].attempts, dead[0].error.as_deref()), (1, 8, Some("refused")));
+    assert!(store.deliveries(webhook.id, Some(DeliveryState::Waiting), ALL).await.unwrap().is_empty());
+
+    let nobody = WebhookId(Uuid::nil());
+    assert!(store.resend_delivery(nobody, dead[0].id, at(200)).await.unwrap().is_none());
+    let waiting = store.resend_delivery(webhook.id, dead[0].id, at(200)).await.unwrap().unwrap();
+    assert_eq!((waiting.state, waiting.finished), (DeliveryState::Waiting, None));
+    let again = take(200).await.unwrap();
+    assert_eq!(again.delivery.attempts, 9);
+    assert!(store.end_delivery(&again, &Sent::Arrived, at(201)).await.unwrap());
+    assert!(!store.end_delivery(&again, &failed(300), at(202)).await.unwrap());
+    let arrived = store.deliveries(webhook.id, Some(DeliveryState::Delivered), ALL).await.unwrap();
+    assert_eq!((arrived[0].finished, &arrived[0].error), (Some(at(201)), &None));
+    store.forget_old_deliveries(at(201)).await.unwrap();
+    assert_eq!(messages(store, &webhook).await.len(), 1);
+    store.forget_old_deliveries(at(202)).await.unwrap();
+    assert!(messages(store, &webhook).await.is_empty());
+}
+
+pub async fn quotas(store: &dyn Store) {
+    let a = plant(store, "A").await;
+    let usage = async || store.usage(ORGANISATION, at(5)).await.unwrap().unwrap();
+    let kept = Usage { bytes: 0, announced_bytes: 0, plants: 1, own: Quotas::default() };
+    assert_eq!(usage().await, kept);
+    assert!(store.usage(OrganisationId(Uuid::max()), at(5)).await.unwrap().is_none());
+
+    // The same bytes count once in a plant, whoever says so again.
+    let (one, two) = ((Digest::of(b"1"), 60), (Digest::of(b"2"), 50));
+    let none = Quotas::default();
+    store.reserve_bytes(a.id, &[one, one], none).await.unwrap();
+    store.reserve_bytes(a.id, &[one], none).await.unwrap();
+    assert_eq!(usage().await.bytes, 60);
+    let tight = Quotas { bytes: Some(100), plants: Some(1) };
+    let refused = store.reserve_bytes(a.id, &[two], tight).await;
+    assert!(matches!(refused, Err(StoreError::OverQuota { what: "bytes", used: 60, quota: 100 })), "{refused:?}");
+    assert_eq!(usage().await.bytes, 60);
+    store.reserve_bytes(a.id, &[one], Quotas { bytes: Some(10), plants: None }).await.unwrap();
+    let nowhere = store.reserve_bytes(PlantId(Uuid::nil()), &[one], none).await;
+    assert!(matches!(nowhere, Err(StoreError::Gone { what: "plant" })));
+
+    // What is said of one organisation goes before what holds for all.
+    let refused = store.create_plant(ORGANISATION, "B", tight, at(1)).await;
+    assert!(matches!(refused, Err(StoreError::OverQuota { what: "plants", used: 1, quota: 1 })), "{refused:?}");
+    assert!(matches!(store.create_plant(ORGANISATION, "A", tight, at(1)).await.unwrap(), Created::Existing(_)));
+    let own = Quotas { bytes: Some(UNLIMITED), plants: Some(2) };
+    store.set_quotas(ORGANISATION, own).await.unwrap();
+    let Created::New(b) = store.create_plant(ORGANISATION, "B", tight, at(1)).await.unwrap() else {
+        panic!("there is room for two")
+    };
+    store.reserve_bytes(b.id, &[two], tight).await.unwrap();
+    let june = survey(store, a.id, "June").await;
+    let upload = |id: u128, length, outcome: bool, expires| Upload {
+        id: UploadId(Uuid::from_u128(id)),
+        survey: june.id,
+        length,
+        received: 0,
+        partial: false,
+        metadata: String::new(),
+        expires: at(expires),
+        outcome: outcome.then(|| "{}".to_owned()),
+    };
+    for upload in [upload(1, 7, false, 9), upload(2, 70, true, 9), upload(3, 700, false, 4)] {
+        store.create_upload(&upload).await.unwrap();
+        if let Some(outcome) = &upload.outcome {
+            store.end_upload(upload.id, outcome).await.unwrap();
+        }
+    }
+    assert_eq!(usage().await, Usage { bytes: 110, announced_bytes: 7, plants: 2, own });
+
+    // A model counts, and what is deleted does not.
+    enqueue(store, &june).await;
+    let claimed = claim(store, 0).await.unwrap();
+    store.complete_job(&claimed, &model(a.id, 1, 1), at(1)).await.unwrap();
+    assert_eq!(usage().await.bytes, 115);
+    store.delete_plant(a.id, at(2)).await.unwrap();
+    assert_eq!(usage().await, Usage { bytes: 50, announced_bytes: 0, plants: 1, own });
+    let Created::New(other) = store.create_organisation("another", at(0)).await.unwrap() else {
+        panic!("there is no such organisation yet")
+    };
+    let all = store.organisations(at(5)).await.unwrap();
+    let names: Vec<_> = all.iter().map(|(organisation, usage)| (organisation.id, usage.bytes)).collect();
+    assert_eq!(names, [(other.id, 0), (ORGANISATION, 50)]);
 }

@@ -65,6 +65,9 @@ on_both!(
     two_models_of_one_version_are_not_written,
     a_deleted_plant_takes_everything_with_it,
     boxes_find_what_touches_them,
+    quotas,
+    webhooks,
+    messages_are_sent_by_one_at_a_time_and_not_for_ever,
 );
 
 /// A data folder of before there were organisations keeps all that it holds.
@@ -105,12 +108,15 @@ async fn rows_survive_the_process_and_two_may_open_at_once() {
     let file = folder.path().join("heliomap.db");
     let (first, second) = tokio::join!(SqliteStore::open(&file), SqliteStore::open(&file));
     let now = jiff::Timestamp::UNIX_EPOCH;
-    let created = first.unwrap().create_plant(OrganisationId::DEFAULT, "A", now).await.unwrap();
+    let created = first.unwrap().create_plant(OrganisationId::DEFAULT, "A", Default::default(), now).await.unwrap();
     assert!(matches!(created, Created::New(_)));
     assert!(matches!(
-        second.unwrap().create_plant(OrganisationId::DEFAULT, "A", now).await.unwrap(),
+        second.unwrap().create_plant(OrganisationId::DEFAULT, "A", Default::default(), now).await.unwrap(),
         Created::Existing(_)
     ));
     let again = SqliteStore::open(&file).await.unwrap();
-    assert!(matches!(again.create_plant(OrganisationId::DEFAULT, "A", now).await.unwrap(), Created::Existing(_)));
+    assert!(matches!(
+        again.create_plant(OrganisationId::DEFAULT, "A", Default::default(), now).await.unwrap(),
+        Created::Existing(_)
+    ));
 }

@@ -60,6 +60,8 @@ pub async fn store(
     // As exact as the store keeps it, so that every answer says the same.
     let now = Timestamp::now();
     let stored = Timestamp::from_millisecond(now.as_millisecond()).unwrap_or(now);
+    let blobs: Vec<_> = files.iter().map(|file| (file.staged.sha256, file.staged.size)).collect();
+    state.store.reserve_bytes(plant, &blobs, state.limits.quotas()).await?;
     let mut records = Vec::with_capacity(files.len());
     for Checked { path, staged, found } in files {
         let Found { size_px, photo, shots } = found;

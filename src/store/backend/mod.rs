@@ -5,12 +5,14 @@ mod access;
 mod read;
 mod requests;
 mod uploads;
+mod usage;
+mod webhooks;
 
 use super::super::sql;
 use super::super::{
     Cancelled, Checkpoint, Claim, Completed, Created, Digest, Ending, Enqueued, Feature, FeatureQuery, FileRecord,
     FileWritten, GeoBox, Heartbeat, Job, JobId, JobRequest, JobState, LayerInfo, Model, NewFeature, NewModel,
-    OrganisationId, Page, Plant, Pool, Progress, Queue, Store, StoreError, Survey, SurveyId, SurveyPath,
+    OrganisationId, Page, Plant, Pool, Progress, Queue, Quotas, Store, StoreError, Survey, SurveyId, SurveyPath,
 };
 use super::{Row, Rows, Tx};
 use crate::plant::{Layer, ModuleId, PlantId};
@@ -20,6 +22,7 @@ use read::{file, job, model, plant, survey};
 use sqlx::Row as _;
 use std::time::Duration;
 use uuid::Uuid;
+use webhooks::announce;
 
 /// A box that covers less of its layer than this is looked up by place.
 const SMALL_BOX_SHARE: f64 = 0.05;
@@ -35,9 +38,11 @@ impl Store for Rows {
         &self,
         organisation: OrganisationId,
         name: &str,
+        defaults: Quotas,
         now: Timestamp,
     ) -> Result<Created<Plant>, StoreError> {
         let mut tx = self.begin().await?;
+        let quota = usage::quotas(&mut tx, &organisation.to_string(), defaults).await?.plants;
         let row = sqlx::query(sql::CREATE_PLANT)
             .bind(Uuid::new_v4().to_string())
             .bind(organisation.to_string())
@@ -47,7 +52,14 @@ impl Store for Rows {
             .await
             .map_err(gone("organisation"))?;
         let created = match row {
-            Some(row) => Created::New(plant(&row)?),
+            Some(row) => {
+                let query = sqlx::query_scalar(sql::PLANTS_OF_ORGANISATION).bind(organisation.to_string());
+                let plants = query.fetch_one(&mut *tx).await.map(|plants: i64| plants as u64)?;
+                if let Some(quota) = quota.filter(|quota| plants > *quota) {
+                    return Err(StoreError::OverQuota { what: "plants", used: plants - 1, quota });
+                }
+                Created::New(plant(&row)?)
+            }
             None => {
                 let query = sqlx::query(sql::PLANT_BY_NAME).bind(organisation.to_string()).bind(name);
                 Created::Existing(plant(&query.fetch_one(&mut *tx).await?)?)
@@ -255,7 +267,11 @@ impl Store for Rows {
         let outcome = match row {
             Some(row) => {
                 sqlx::query(sql::SWEEP_CHECKPOINTS).execute(&mut *tx).await?;
-                Some(Cancelled::Accepted(job(&row)?))
+                let job = job(&row)?;
+                if job.state.is_final() {
+                    announce(&mut tx, id, now).await?;
+                }
+                Some(Cancelled::Accepted(job))
             }
             None => {
                 let query = sqlx::query(sql::JOB).bind(plant.to_string()).bind(id.to_string());
@@ -292,10 +308,13 @@ impl Store for Rows {
         let buried = sqlx::query(sql::BURY_ABANDONED_JOBS)
             .bind(now.as_millisecond())
             .bind("every worker that took this job fell silent; see the workers' logs, then start a new job")
-            .execute(&mut *tx)
+            .fetch_all(&mut *tx)
             .await?;
-        if buried.rows_affected() > 0 {
+        if !buried.is_empty() {
             sqlx::query(sql::SWEEP_CHECKPOINTS).execute(&mut *tx).await?;
+        }
+        for row in &buried {
+            announce(&mut tx, JobId(read::uuid(row, "id")?), now).await?;
         }
         let row = sqlx::query(sql::CLAIM_JOB)
             .bind(worker)
@@ -393,6 +412,8 @@ impl Store for Rows {
             return Ok(Completed::Outdated);
         };
         let stored = model(&row)?;
+        // A model counts, and no quota keeps a job from its end.
+        usage::count_bytes(&mut tx, claim.job.plant, &[(new.sha256, new.size)]).await?;
         for layer in &new.layers {
             let extents = || layer.features.iter().filter_map(|feature| feature.extent);
             let extent = extents().reduce(GeoBox::union);
@@ -413,6 +434,7 @@ impl Store for Rows {
             }
         }
         sqlx::query(sql::SWEEP_CHECKPOINTS).execute(&mut *tx).await?;
+        announce(&mut tx, claim.job.id, now).await?;
         tx.commit().await?;
         Ok(Completed::Done(Box::new(stored)))
     }
@@ -448,6 +470,9 @@ impl Store for Rows {
             .execute(&mut *tx)
             .await?;
         sqlx::query(sql::SWEEP_CHECKPOINTS).execute(&mut *tx).await?;
+        if finished_ms.is_some() {
+            announce(&mut tx, claim.job.id, now).await?;
+        }
         tx.commit().await?;
         Ok(done.rows_affected() > 0)
     }

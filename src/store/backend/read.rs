@@ -4,8 +4,9 @@ use super::super::Row;
 use crate::plant::{PlantId, Warning};
 use crate::store::requests::KeptAnswer;
 use crate::store::{
-    ApiKey, AuditEntry, Digest, FileRecord, Job, JobId, KeyId, Model, Organisation, OrganisationId, Plant, Progress,
-    StoreError, Survey, SurveyId, SurveyPath, Upload, UploadId,
+    ApiKey, AuditEntry, Delivery, DeliveryId, Digest, FileRecord, Job, JobId, KeyId, Model, Organisation,
+    OrganisationId, Plant, Progress, Quotas, StoreError, Survey, SurveyId, SurveyPath, Upload, UploadId, Usage,
+    Webhook, WebhookId,
 };
 use jiff::Timestamp;
 use serde::de::DeserializeOwned;
@@ -28,6 +29,17 @@ pub fn organisation(row: &Row) -> Result<Organisation, StoreError> {
         id: OrganisationId(uuid(row, "id")?),
         name: row.try_get("name")?,
         created: time(row, "created_ms")?,
+    })
+}
+
+pub fn usage(row: &Row) -> Result<Usage, StoreError> {
+    let count = |column: &str| Ok::<_, StoreError>(row.try_get::<i64, _>(column)? as u64);
+    let quota = |column: &str| Ok::<_, StoreError>(row.try_get::<Option<i64>, _>(column)?.map(|quota| quota as u64));
+    Ok(Usage {
+        bytes: count("bytes")?,
+        announced_bytes: count("announced_bytes")?,
+        plants: count("plants")?,
+        own: Quotas { bytes: quota("max_bytes")?, plants: quota("max_plants")? },
     })
 }
 
@@ -121,6 +133,34 @@ pub fn kept_answer(row: &Row) -> Result<Option<KeptAnswer>, StoreError> {
         headers: row.try_get("headers")?,
         body: row.try_get("body")?,
     }))
+}
+
+pub fn webhook(row: &Row) -> Result<Webhook, StoreError> {
+    let plant: Option<String> = row.try_get("plant_id")?;
+    Ok(Webhook {
+        seq: row.try_get("seq")?,
+        id: WebhookId(uuid(row, "id")?),
+        organisation: OrganisationId(uuid(row, "organisation_id")?),
+        plant: plant.map(|_| uuid(row, "plant_id").map(PlantId)).transpose()?,
+        url: row.try_get("url")?,
+        created: time(row, "created_ms")?,
+    })
+}
+
+pub fn delivery(row: &Row) -> Result<Delivery, StoreError> {
+    Ok(Delivery {
+        seq: row.try_get("seq")?,
+        id: DeliveryId(uuid(row, "id")?),
+        webhook: WebhookId(uuid(row, "webhook_id")?),
+        job: JobId(uuid(row, "job_id")?),
+        state: parsed(row, "state")?,
+        attempts: small("attempts", row.try_get("attempts")?)?,
+        attempts_left: small("attempts_left", row.try_get("attempts_left")?)?,
+        run_after: time(row, "run_after_ms")?,
+        error: row.try_get("error")?,
+        created: time(row, "created_ms")?,
+        finished: optional_time(row, "finished_ms")?,
+    })
 }
 
 pub fn job(row: &Row) -> Result<Job, StoreError> {

@@ -1,0 +1,51 @@
+//! What an organisation keeps, and what it may keep.
+
+use super::{Digest, Organisation, OrganisationId, StoreError};
+use crate::plant::PlantId;
+use jiff::Timestamp;
+
+/// As much as there is room for.
+pub const UNLIMITED: u64 = i64::MAX as u64;
+
+/// What an organisation may keep; where nothing is said, what holds for all.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Quotas {
+    /// Bytes of files and models.
+    pub bytes: Option<u64>,
+    /// Plants.
+    pub plants: Option<u64>,
+}
+
+impl Quotas {
+    /// These, and others for what they do not say.
+    pub fn or(self, others: Self) -> Self {
+        Self { bytes: self.bytes.or(others.bytes), plants: self.plants.or(others.plants) }
+    }
+}
+
+/// What an organisation keeps.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Usage {
+    /// Bytes of files and models; in a plant, the same bytes count once.
+    pub bytes: u64,
+    /// Bytes that resumable uploads announced and that are not stored yet.
+    pub announced_bytes: u64,
+    pub plants: u64,
+    /// What was said of this organisation alone.
+    pub own: Quotas,
+}
+
+/// What organisations keep, and may keep.
+#[async_trait::async_trait]
+pub trait UsageStore: Send + Sync + 'static {
+    /// All organisations by name, each with what it keeps.
+    async fn organisations(&self, now: Timestamp) -> Result<Vec<(Organisation, Usage)>, StoreError>;
+    /// What an organisation keeps.
+    async fn usage(&self, organisation: OrganisationId, now: Timestamp) -> Result<Option<Usage>, StoreError>;
+    /// Says what an organisation may keep.
+    async fn set_quotas(&self, organisation: OrganisationId, own: Quotas) -> Result<(), StoreError>;
+    /// Counts bytes that are about to be stored in a plant, each by digest and size; those that it keeps already count for
+    /// nothing more. [`StoreError::OverQuota`] where they do not fit: none is counted then. `defaults` holds for what was not
+    /// said of the organisation alone.
+    async fn reserve_bytes(&self, plant: PlantId, blobs: &[(Digest, u64)], defaults: Quotas) -> Result<(), StoreError>;
+}

@@ -1,0 +1,157 @@
+//! Sends messages: each process that serves or works takes those that are due, under a lease, so that no two send the same
+//! at once and none is lost with the process that had it.
+
+use super::{HEADER, Message, Targets, sign};
+use crate::store::{DeliveryClaim, Sent, Store};
+use crate::telemetry::Metrics;
+use crate::telemetry::metrics::OutcomeLabels;
+use jiff::Timestamp;
+use reqwest::{Client, redirect};
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::task::JoinSet;
+use tokio_util::sync::CancellationToken;
+
+/// How many messages one process sends at once.
+const AT_ONCE: usize = 8;
+/// The longest time between two tries.
+const LONGEST_PAUSE: Duration = Duration::from_secs(6 * 3600);
+
+/// A sender's times.
+#[derive(Debug, Clone, Copy)]
+pub struct SenderSettings {
+    /// How often it looks for messages.
+    pub poll: Duration,
+    /// How long a receiver may take to answer.
+    pub timeout: Duration,
+    /// How long a message stays in the hands of who took it; far above `timeout`.
+    pub lease: Duration,
+    /// How long after a first failure a message is tried again; five times as long after each further one, up to six hours.
+    pub backoff: Duration,
+}
+
+impl Default for SenderSettings {
+    fn default() -> Self {
+        Self {
+            poll: Duration::from_secs(1),
+            timeout: Duration::from_secs(10),
+            lease: Duration::from_secs(60),
+            backoff: Duration::from_secs(5),
+        }
+    }
+}
+
+/// Sends messages.
+#[derive(Clone)]
+pub struct Sender {
+    store: Arc<dyn Store>,
+    targets: Targets,
+    settings: SenderSettings,
+    metrics: Metrics,
+    client: Client,
+}
+
+impl Sender {
+    /// One that sends to these targets.
+    ///
+    /// # Errors
+    /// Where the system gives no certificates to check receivers by.
+    pub fn new(
+        store: Arc<dyn Store>,
+        targets: Targets,
+        settings: SenderSettings,
+        metrics: Metrics,
+    ) -> Result<Self, reqwest::Error> {
+        crate::tls::provide();
+        let client = Client::builder()
+            .user_agent(concat!("heliomap/", env!("CARGO_PKG_VERSION")))
+            .timeout(settings.timeout)
+            // A redirection, or a proxy, would lead past what is checked here.
+            .redirect(redirect::Policy::none())
+            .no_proxy()
+            .dns_resolver(targets)
+            .build()?;
+        Ok(Self { store, targets, settings, metrics, client })
+    }
+
+    /// Sends what is due until `stop`; what is being sent then may end.
+    pub async fn run(&self, stop: CancellationToken) {
+        let mut sending = JoinSet::new();
+        while !stop.is_cancelled() {
+            while sending.len() < AT_ONCE {
+                match self.store.claim_delivery(self.settings.lease, Timestamp::now()).await {
+                    Ok(Some(claim)) => {
+                        let sender = self.clone();
+                        sending.spawn(async move { sender.deliver(claim).await });
+                    }
+                    Ok(None) => break,
+                    Err(error) => {
+                        tracing::error!(%error, "cannot look for messages to webhooks");
+                        break;
+                    }
+                }
+            }
+            tokio::select! {
+                () = stop.cancelled() => {}
+                Some(_) = sending.join_next() => {}
+                () = tokio::time::sleep(self.settings.poll) => {}
+            }
+        }
+        while sending.join_next().await.is_some() {}
+    }
+
+    /// Sends one message and notes what became of it.
+    async fn deliver(&self, claim: DeliveryClaim) {
+        let sent = match self.send(&claim).await {
+            Ok(()) => Sent::Arrived,
+            Err(error) => Sent::Failed { error, at: Timestamp::now() + self.pause(claim.delivery.attempts_left) },
+        };
+        let outcome = match &sent {
+            Sent::Arrived => "delivered",
+            Sent::Failed { .. } if claim.delivery.attempts_left == 0 => "given_up",
+            Sent::Failed { .. } => "failed",
+        };
+        self.metrics.deliveries.get_or_create(&OutcomeLabels { outcome }).inc();
+        let (webhook, delivery) = (claim.delivery.webhook, claim.delivery.id);
+        tracing::info!(%webhook, %delivery, outcome, attempt = claim.delivery.attempts, "message to a webhook");
+        if let Err(error) = self.store.end_delivery(&claim, &sent, Timestamp::now()).await {
+            // The lease runs out and it is sent again.
+            tracing::error!(%error, %delivery, "cannot note what became of a message to a webhook");
+        }
+    }
+
+    /// How long to wait after a failure.
+    fn pause(&self, attempts_left: u32) -> Duration {
+        let failed_before = crate::store::webhooks::MAX_ATTEMPTS.saturating_sub(attempts_left + 1);
+        self.settings.backoff.saturating_mul(5_u32.saturating_pow(failed_before)).min(LONGEST_PAUSE)
+    }
+
+    /// Why a message did not arrive, where it did not. Of the answer nothing but its status is read.
+    async fn send(&self, claim: &DeliveryClaim) -> Result<(), String> {
+        let url = self.targets.check(&claim.url).map_err(|error| error.to_string())?;
+        let message = Message::from(claim);
+        let body = serde_json::to_vec(&message).map_err(|error| error.to_string())?;
+        let signature = sign(&claim.secret, Timestamp::now(), &body);
+        let request = self.client.post(url).header("content-type", "application/json").header(HEADER, signature);
+        let answer = request.body(body).send().await.map_err(|error| told(&error))?;
+        match answer.status() {
+            status if status.is_success() => Ok(()),
+            status if status.is_redirection() => {
+                Err(format!("the receiver answered {status}; redirections are not followed: register where they lead"))
+            }
+            status => Err(format!("the receiver answered {status}")),
+        }
+    }
+}
+
+/// What failed, without the URL.
+fn told(error: &reqwest::Error) -> String {
+    if error.is_timeout() {
+        return "the receiver did not answer in time".to_owned();
+    }
+    let mut cause: &dyn std::error::Error = error;
+    while let Some(source) = cause.source() {
+        cause = source;
+    }
+    format!("no connection: {cause}")
+}

@@ -1,0 +1,83 @@
+//! What an organisation may keep, and no more.
+
+use crate::app::{Act, App, assert_problem, jpeg, json_of, plant_path};
+use heliomap::config::Limits;
+use heliomap::store::{OrganisationId, Quotas};
+use reqwest::{Method, StatusCode};
+use serde_json::json;
+
+/// So much that what a survey needs fits, and little more.
+const QUOTA: u64 = 8_000;
+
+fn limits() -> Limits {
+    Limits { quota_bytes: Some(QUOTA), quota_plants: Some(2), ..Limits::default() }
+}
+
+#[tokio::test]
+async fn uploads_beyond_the_quota_are_refused_and_what_is_kept_is_told() {
+    let app = App::with_limits(&[Act::Map(2)], limits()).await;
+    let survey = app.complete_survey().await;
+    let (_, usage) = app.get("/api/v1/usage").await;
+    let bytes = usage["bytes"].as_u64().unwrap();
+    // Two photos of the same bytes count once.
+    let files = [jpeg(32, 24).len(), "[{\"shots\": {}}]".len(), "{\"latitude\": 50}".len()];
+    assert_eq!(bytes, files.iter().sum::<usize>() as u64);
+    assert_eq!(usage, json!({"bytes": bytes, "announced_bytes": 0, "max_bytes": QUOTA, "plants": 1, "max_plants": 2}));
+
+    let photo = jpeg(200, 150);
+    assert!(photo.len() as u64 > QUOTA - bytes, "{}", photo.len());
+    let put = || app.request(Method::PUT, &format!("{survey}/images/large.jpg"));
+    let known = put().body(photo.clone()).send().await.unwrap();
+    assert_problem(json_of(known).await, 507, "quota_exceeded", "higher quota");
+    // Without a length it is told on the way.
+    let pieces: Vec<_> = photo.chunks(512).map(|piece| Ok::<_, std::io::Error>(piece.to_vec())).collect();
+    let body = reqwest::Body::wrap_stream(futures::stream::iter(pieces));
+    let unknown = put().body(body).send().await.unwrap();
+    assert_problem(json_of(unknown).await, 507, "quota_exceeded", "larger than");
+    let begin = |length: u64| {
+        let request = app.request(Method::POST, &format!("{survey}/uploads")).header("tus-resumable", "1.0.0");
+        request.header("upload-length", length).header("upload-metadata", "filename Yi5qcGc=").send()
+    };
+    assert_problem(json_of(begin(QUOTA).await.unwrap()).await, 507, "quota_exceeded", "higher quota");
+    // What was announced counts until it is stored or ended.
+    let begun = begin(QUOTA - bytes).await.unwrap();
+    assert_eq!(begun.status(), StatusCode::CREATED);
+    assert_problem(json_of(begin(1).await.unwrap()).await, 507, "quota_exceeded", "keeps 8000 of the 8000 bytes");
+    let upload = begun.headers()["location"].to_str().unwrap().to_owned();
+    let end = app.request(Method::DELETE, &upload).header("tus-resumable", "1.0.0").send().await.unwrap();
+    assert_eq!(end.status(), StatusCode::NO_CONTENT);
+
+    // An archive that unpacks to more than fits.
+    let mut archive = tar::Builder::new(flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::best()));
+    let cloud = [b"ply\n".to_vec(), vec![b' '; QUOTA as usize]].concat();
+    let mut header = tar::Header::new_gnu();
+    header.set_size(cloud.len() as u64);
+    header.set_mode(0o644);
+    archive.append_data(&mut header, "undistorted/depthmaps/merged.ply", cloud.as_slice()).unwrap();
+    let archive = archive.into_inner().unwrap().finish().unwrap();
+    assert!((archive.len() as u64) < QUOTA - bytes);
+    let unpacked = app.put(&format!("{survey}/reconstruction"), archive).await;
+    assert_problem(unpacked, 507, "quota_exceeded", "8000 bytes");
+
+    let (_, found) = app.get(&survey).await;
+    assert_eq!(found["files"].as_array().unwrap().len(), 4, "{found}");
+    assert_eq!(app.get("/api/v1/usage").await.1, usage);
+    // Jobs and their models are never refused.
+    assert_eq!(app.map(&survey).await["state"], "succeeded");
+    assert!(app.get("/api/v1/usage").await.1["bytes"].as_u64().unwrap() > bytes);
+    let gone = app.request(Method::DELETE, plant_path(&survey)).send().await.unwrap();
+    assert_eq!(gone.status(), StatusCode::NO_CONTENT);
+    assert_eq!(app.get("/api/v1/usage").await.1["bytes"], 0);
+}
+
+#[tokio::test]
+async fn an_organisation_has_as_many_plants_as_it_may() {
+    let app = App::with_limits(&[], limits()).await;
+    let create = async |name: &str| app.post("/api/v1/plants", json!({"name": name})).await;
+    assert_eq!((create("one").await.0, create("two").await.0), (StatusCode::CREATED, StatusCode::CREATED));
+    assert_problem(create("three").await, 507, "quota_exceeded", "2 of the 2 plants");
+    assert_eq!(create("two").await.0, StatusCode::OK);
+    app.store.set_quotas(OrganisationId::DEFAULT, Quotas { bytes: None, plants: Some(3) }).await.unwrap();
+    assert_eq!(create("three").await.0, StatusCode::CREATED);
+    assert_eq!(app.get("/api/v1/usage").await.1["max_plants"], 3);
+}
