@@ -17,7 +17,7 @@ export ORT_DYLIB_PATH ?= $(abspath $(ORT_LIBRARY))
 HELIOMAP_DATA ?= $(wildcard ../shared/data)
 export HELIOMAP_DATA
 
-.PHONY: help setup web demo test lint unit client kills tus contract query load structure bench scaling yolo-export openapi clean
+.PHONY: help setup web demo test lint unit client kills tus contract query load structure bench scaling yolo-export openapi configuration clean
 
 help: ## List the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -126,6 +126,9 @@ yolo-export: setup ## Build and export an untrained network of the YOLOv8-seg fa
 
 openapi: ## Write openapi.yaml anew from the code
 	$(CARGO) run --locked --quiet -- openapi > openapi.yaml.new && mv openapi.yaml.new openapi.yaml
+
+configuration: ## Write docs/CONFIGURATION.md anew from the command line
+	$(CARGO) run --locked --quiet -- configuration > CONFIGURATION.md.new && mv CONFIGURATION.md.new docs/CONFIGURATION.md
 
 clean: ## Remove everything that was built or fetched
 	rm -rf target .ort web/dist web/node_modules

@@ -1,4 +1,6 @@
-//! The command line: flags, each with an environment variable, parsed once.
+//! The command line: flags, each with an environment variable and a place in a file, parsed once.
+
+pub mod file;
 
 use crate::detection::{self, DetectionError, Detector, ExecutionProvider, RuntimeSettings};
 use crate::plant::PlantId;
@@ -20,6 +22,19 @@ pub struct LogArgs {
     /// How they are written.
     #[arg(long, env = "HELIOMAP_LOG_FORMAT", value_enum, default_value = "pretty", global = true)]
     pub log_format: LogFormat,
+    /// A YAML file of settings, `flag: value` in each line; flags and environment go before it.
+    #[arg(long, env = file::VARIABLE, global = true, value_name = "FILE")]
+    pub config: Option<PathBuf>,
+}
+
+/// Where traces are sent.
+#[derive(Debug, Clone, Default, Args)]
+pub struct TraceArgs {
+    /// An OpenTelemetry collector to send traces of requests and jobs to, by OTLP over HTTP, `http://127.0.0.1:4318`. Where it
+    /// is not given, the variables OTEL_EXPORTER_OTLP_ENDPOINT and OTEL_EXPORTER_OTLP_TRACES_ENDPOINT count; headers, sampling
+    /// and batches are set by the other OTEL_ variables.
+    #[arg(long, env = "HELIOMAP_OTLP_ENDPOINT", global = true, value_name = "URL")]
+    pub otlp_endpoint: Option<String>,
 }
 
 /// How events are written.
@@ -116,6 +131,17 @@ pub struct JobArgs {
     /// Seconds after which a job whose worker fell silent is taken up by another.
     #[arg(long, env = "HELIOMAP_LEASE", default_value = "30", value_parser = parse_seconds, value_name = "SECONDS")]
     pub lease: Duration,
+}
+
+/// `heliomap doctor`.
+#[derive(Debug, Clone, Args)]
+pub struct DoctorArgs {
+    /// The settings that the service would have.
+    #[command(flatten)]
+    pub serve: ServeArgs,
+    /// Print JSON: a list of checks, each with `name`, `verdict` (`ok`, `warning` or `failed`), `found` and `advice`.
+    #[arg(long)]
+    pub json: bool,
 }
 
 /// `heliomap keys`.

@@ -2,8 +2,10 @@
 
 mod commands;
 
-use clap::{Parser, Subcommand};
-use heliomap::config::{KeysArgs, LogArgs, OpenapiArgs, OrganisationsArgs, ServeArgs, WorkerArgs};
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
+use heliomap::config::{
+    DoctorArgs, KeysArgs, LogArgs, OpenapiArgs, OrganisationsArgs, ServeArgs, TraceArgs, WorkerArgs, file,
+};
 
 /// Maps photovoltaic plants from drone overview photos: every module georeferenced, with its place in the plant.
 #[derive(Debug, Parser)]
@@ -11,6 +13,8 @@ use heliomap::config::{KeysArgs, LogArgs, OpenapiArgs, OrganisationsArgs, ServeA
 struct Cli {
     #[command(flatten)]
     log: LogArgs,
+    #[command(flatten)]
+    traces: TraceArgs,
     #[command(subcommand)]
     command: Command,
 }
@@ -34,14 +38,27 @@ enum Command {
     Evaluate(commands::evaluate::EvaluateArgs),
     /// Measure a detector, or a file of boxes, against labelled photos.
     EvaluateDetection(commands::evaluate_detection::EvaluateDetectionArgs),
+    /// Check that what the service needs is there and works, and say what to do where it does not.
+    Doctor(DoctorArgs),
     /// Print the description of the HTTP API.
     Openapi(OpenapiArgs),
+    /// Print docs/CONFIGURATION.md: every flag, environment variable and setting.
+    #[command(hide = true)]
+    Configuration,
 }
 
 fn main() -> anyhow::Result<()> {
-    let cli = Cli::parse();
-    heliomap::telemetry::init(&cli.log)?;
-    match cli.command {
+    let cli = parse()?;
+    let traces = heliomap::telemetry::init(&cli.log, &cli.traces)?;
+    let outcome = run(cli.command);
+    if let Some(traces) = traces {
+        traces.end();
+    }
+    outcome
+}
+
+fn run(command: Command) -> anyhow::Result<()> {
+    match command {
         Command::Serve(args) => commands::serve::run(args),
         Command::Worker(args) => commands::worker::run(args),
         Command::Keys(args) => commands::keys::run(args),
@@ -50,19 +67,41 @@ fn main() -> anyhow::Result<()> {
         Command::Detect(args) => commands::detect::run(&args),
         Command::EvaluateDetection(args) => commands::evaluate_detection::run(&args),
         Command::Evaluate(args) => commands::evaluate::run(&args),
+        Command::Doctor(args) => commands::doctor::run(args),
         Command::Openapi(args) => commands::openapi::run(&args),
+        Command::Configuration => {
+            commands::configuration::run(&Cli::command());
+            Ok(())
+        }
     }
+}
+
+/// Reads the command line, with the configuration file that it names.
+fn parse() -> anyhow::Result<Cli> {
+    let command = match file::named(std::env::args_os()) {
+        Some(path) => file::with_file(Cli::command(), &path)?,
+        None => Cli::command(),
+    };
+    Ok(Cli::from_arg_matches(&command.get_matches()).unwrap_or_else(|error| error.exit()))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use clap::CommandFactory;
     use heliomap::config::Limits;
 
     #[test]
     fn the_command_line_is_consistent() {
         Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn every_setting_is_documented() {
+        let written = commands::configuration::document(&Cli::command());
+        assert!(
+            written == include_str!("../docs/CONFIGURATION.md"),
+            "run `make configuration` and review the difference"
+        );
     }
 
     #[test]

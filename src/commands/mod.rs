@@ -1,6 +1,8 @@
 //! One file per command. Here alone, concrete backends are named.
 
+pub mod configuration;
 pub mod detect;
+pub mod doctor;
 pub mod evaluate;
 pub mod evaluate_detection;
 pub mod keys;
@@ -19,6 +21,7 @@ use heliomap::telemetry::metrics::{self, Metrics, Scrape};
 use heliomap::webhooks::{Sender, SenderSettings};
 use jiff::Timestamp;
 use object_store::aws::AmazonS3Builder;
+use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::net::TcpListener;
@@ -35,25 +38,32 @@ const OLD_DELIVERIES: Duration = Duration::from_secs(30 * 24 * 3600);
 /// How long work in progress may take to end once the process was told to stop.
 const GRACE: Duration = Duration::from_secs(20);
 
+/// What is said of a data folder that cannot be used.
+fn unusable(folder: &Path) -> String {
+    format!("cannot use the data folder {}; choose another with --data-dir", folder.display())
+}
+
+/// The blobs of a data folder, or of a bucket beside it.
+async fn open_blobs(args: &StorageArgs) -> anyhow::Result<Blobs> {
+    let folder = &args.data_dir;
+    let Some(bucket) = &args.blobs else { return Blobs::in_folder(folder).with_context(|| unusable(folder)) };
+    let hint = || {
+        format!(
+            "cannot use the bucket {} of --blobs; check that it is there, and AWS_ENDPOINT_URL, AWS_REGION, \
+             AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY",
+            bucket.name
+        )
+    };
+    let blobs = Blobs::in_bucket(folder, bucket, AmazonS3Builder::from_env()).with_context(hint)?;
+    blobs.ping().await.with_context(hint)?;
+    Ok(blobs)
+}
+
 /// The database and the blobs of a data folder.
 async fn open_storage(args: &StorageArgs) -> anyhow::Result<(Arc<dyn Store>, Blobs)> {
     let folder = &args.data_dir;
-    let hint = || format!("cannot use the data folder {}; choose another with --data-dir", folder.display());
-    let blobs = match &args.blobs {
-        None => Blobs::in_folder(folder).with_context(hint)?,
-        Some(bucket) => {
-            let hint = || {
-                format!(
-                    "cannot use the bucket {} of --blobs; check that it is there, and AWS_ENDPOINT_URL, AWS_REGION, \
-                     AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY",
-                    bucket.name
-                )
-            };
-            let blobs = Blobs::in_bucket(folder, bucket, AmazonS3Builder::from_env()).with_context(hint)?;
-            blobs.ping().await.with_context(hint)?;
-            blobs
-        }
-    };
+    let hint = || unusable(folder);
+    let blobs = open_blobs(args).await?;
     blobs.sweep_staging(STALE_UPLOADS).await.with_context(hint)?;
     let store: Arc<dyn Store> = match &args.database {
         // The URL may hold a password: it is not said again.

@@ -6,8 +6,8 @@ use super::{
     models, page, plants, surveys, tus, uploads, usage, webhooks,
 };
 use crate::config::NetworkArgs;
-use crate::telemetry::Metrics;
 use crate::telemetry::metrics::RequestLabels;
+use crate::telemetry::{Metrics, traces};
 use axum::Router;
 use axum::body::Body;
 use axum::extract::{DefaultBodyLimit, MatchedPath, Request, State};
@@ -190,8 +190,16 @@ async fn sane_request_id(mut request: Request, next: Next) -> Response {
 }
 
 fn span(request: &axum::http::Request<Body>) -> Span {
-    let id = guard::request_id(request);
-    tracing::info_span!("request", method = %request.method(), path = request.uri().path(), id)
+    let (id, method, path) = (guard::request_id(request), request.method(), request.uri().path());
+    if !traces::are_on() {
+        return tracing::info_span!("request", %method, path, id);
+    }
+    // By its route, as metrics are: what clients put into paths makes no new name.
+    let route = request.extensions().get::<MatchedPath>().map_or("", MatchedPath::as_str);
+    let name = format!("{method} {route}");
+    let span = tracing::info_span!("request", %method, path, id, otel.name = name.trim_end(), otel.kind = "server");
+    traces::join(&span, request.headers());
+    span
 }
 
 fn log_response<B>(response: &axum::http::Response<B>, latency: Duration, _: &Span) {

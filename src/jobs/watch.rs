@@ -7,6 +7,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::sync::atomic::{AtomicU8, Ordering};
 use std::sync::{Mutex, MutexGuard};
 use std::time::Instant;
+use tracing::Span;
 
 /// Why a running job must stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -42,6 +43,8 @@ struct Seen {
     images: u64,
     /// How many images were recalled, which takes no time.
     recalled: u64,
+    /// The span of the stage that runs, which ends when it is dropped.
+    span: Option<Span>,
 }
 
 /// What a job has found, and what an earlier attempt at it had.
@@ -54,18 +57,32 @@ struct Findings {
 }
 
 /// One job's progress, findings and stop sign.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct Watch {
     seen: Mutex<Seen>,
     findings: Mutex<Findings>,
     stop: AtomicU8,
+    /// The job's span, that of its stages stand in.
+    span: Span,
 }
 
 fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(|poisoned| poisoned.into_inner())
 }
 
+impl Default for Watch {
+    /// Of a job whose span is the current one.
+    fn default() -> Self {
+        Self { seen: Mutex::default(), findings: Mutex::default(), stop: AtomicU8::new(0), span: Span::current() }
+    }
+}
+
 impl Watch {
+    /// Ends the span of the stage that ran last.
+    pub fn end(&self) {
+        locked(&self.seen).span = None;
+    }
+
     /// Raises the stop sign; the first reason stays, but a lost job is lost whatever else was asked.
     pub fn stop(&self, reason: Stop) {
         if reason == Stop::Lost {
@@ -155,6 +172,10 @@ impl Observer for Watch {
         }
         if seen.begun.last().is_none_or(|(last, _)| *last < stage) {
             seen.begun.push((stage, Instant::now()));
+            let name = format!("stage {}", stage.as_str());
+            // The one before ends first.
+            seen.span = None;
+            seen.span = Some(tracing::info_span!(parent: &self.span, "stage", otel.name = name));
         }
         if stage == Stage::Detect {
             seen.images = total as u64;
@@ -242,6 +263,7 @@ mod tests {
             begun: vec![(Stage::Read, begun), (Stage::Detect, begun)],
             images: 10,
             recalled: 2,
+            span: None,
         };
         let later = begun + Duration::from_secs(6);
         assert_eq!(seen.remaining_ms(None, later), None);

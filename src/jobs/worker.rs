@@ -67,7 +67,7 @@ impl Worker {
         while !stop.is_cancelled() {
             let pause = match self.store.claim_job(&self.name, self.settings.lease, Timestamp::now()).await {
                 Ok(Some(claim)) => {
-                    let span = tracing::info_span!("job", job = %claim.job.id, attempt = claim.job.attempt);
+                    let span = tracing::info_span!("job", job = %claim.job.id, plant = %claim.job.plant, attempt = claim.job.attempt);
                     self.work(claim, &stop).instrument(span).await;
                     continue;
                 }
@@ -97,6 +97,7 @@ impl Worker {
             outcome = &mut attempt => Some(outcome),
             () = self.beat(&claim, &watch, stop) => None,
         };
+        watch.end();
         let straggles = outcome.is_none();
         let outcome = outcome.unwrap_or(Err(MapError::Cancelled.into()));
         if let Err(error) = self.settle(&claim, &watch, outcome).await {

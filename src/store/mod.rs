@@ -9,6 +9,7 @@ pub mod bucket;
 pub mod postgres;
 pub mod records;
 pub mod requests;
+pub mod schema;
 pub mod secret;
 pub mod sqlite;
 pub mod survey_path;

@@ -4,6 +4,7 @@
 mod backend;
 
 use super::StoreError;
+use super::schema::Examined;
 use sqlx::postgres::{PgPool, PgPoolOptions};
 use sqlx::{Postgres, Transaction};
 use std::time::Duration;
@@ -16,6 +17,8 @@ type Tx = Transaction<'static, Postgres>;
 const ACQUIRE_TIMEOUT: Duration = Duration::from_secs(20);
 /// Most connections of one process.
 const MAX_CONNECTIONS: u32 = 10;
+/// Milliseconds since 1970 by the server's clock.
+const CLOCK: Option<&str> = Some("SELECT CAST(EXTRACT(EPOCH FROM clock_timestamp()) * 1000 AS BIGINT)");
 /// The lock under which jobs are queued and claimed: any number, as long as nothing else in the database takes it.
 const QUEUE_LOCK: i64 = 0x6865_6c69_6f6d_6170;
 
@@ -33,6 +36,14 @@ impl PostgresStore {
         let pool = options.connect(url).await?;
         sqlx::migrate!("migrations/postgres").run(&pool).await?;
         Ok(Self { read: pool.clone(), write: pool })
+    }
+
+    /// Looks at the database at a URL without changing its schema.
+    pub async fn examine(url: &str) -> Result<Examined, StoreError> {
+        let options = PgPoolOptions::new().max_connections(1).acquire_timeout(ACQUIRE_TIMEOUT / 4);
+        let pool = options.connect(url).await?;
+        let rows = Self { read: pool.clone(), write: pool };
+        backend::examine::examine(&rows, &sqlx::migrate!("migrations/postgres")).await
     }
 
     /// Name, open and idle connections of each pool.

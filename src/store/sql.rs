@@ -44,6 +44,8 @@ macro_rules! model {
 }
 
 pub const PING: &str = "SELECT 1";
+pub const MADE_CHANGES: &str = "SELECT version FROM _sqlx_migrations WHERE success ORDER BY version";
+pub const ANY_KEY: &str = "SELECT 1 FROM api_keys WHERE revoked_ms IS NULL LIMIT 1";
 
 pub const CREATE_ORGANISATION: &str = "\
     INSERT INTO organisations (id, name, created_ms) VALUES ($1, $2, $3) ON CONFLICT (name) DO NOTHING \

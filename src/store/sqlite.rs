@@ -5,6 +5,7 @@ mod backend;
 
 use super::StoreError;
 use super::blobs::io;
+use super::schema::Examined;
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePool, SqlitePoolOptions, SqliteSynchronous};
 use sqlx::{Sqlite, Transaction};
 use std::path::Path;
@@ -16,6 +17,9 @@ type Tx = Transaction<'static, Sqlite>;
 
 /// How long a statement waits for another process's transaction.
 const BUSY_TIMEOUT: Duration = Duration::from_secs(20);
+
+/// It has no clock but this machine's.
+const CLOCK: Option<&str> = None;
 
 /// How many rows of an answer may wait to be read.
 const ROWS_AT_ONCE: usize = 2048;
@@ -45,6 +49,14 @@ impl SqliteStore {
         let write = SqlitePoolOptions::new().max_connections(1).connect_with(options.clone()).await?;
         let read = SqlitePoolOptions::new().max_connections(8).connect_with(options).await?;
         Ok(Self { read, write })
+    }
+
+    /// Looks at a file without changing its schema.
+    pub async fn examine(file: &Path) -> Result<Examined, StoreError> {
+        let options = SqliteConnectOptions::new().filename(file).busy_timeout(BUSY_TIMEOUT).foreign_keys(true);
+        let write = SqlitePoolOptions::new().max_connections(1).connect_with(options).await?;
+        let rows = Self { read: write.clone(), write };
+        backend::examine::examine(&rows, &sqlx::migrate!("migrations/sqlite")).await
     }
 
     /// Name, open and idle connections of each pool.

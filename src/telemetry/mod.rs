@@ -1,20 +1,39 @@
-//! What the service tells of itself: structured events to standard error, and metrics.
+//! What the service tells of itself: structured events to standard error, metrics, and traces.
 
 pub mod metrics;
+pub mod traces;
 
 pub use metrics::Metrics;
+pub use traces::Traces;
 
-use crate::config::{LogArgs, LogFormat};
-use tracing_subscriber::EnvFilter;
-use tracing_subscriber::filter::ParseError;
+use crate::config::{LogArgs, LogFormat, TraceArgs};
+use opentelemetry_otlp::ExporterBuildError;
+use tracing::level_filters::LevelFilter;
+use tracing_subscriber::filter::{ParseError, Targets};
+use tracing_subscriber::layer::SubscriberExt;
+use tracing_subscriber::util::SubscriberInitExt;
+use tracing_subscriber::{EnvFilter, Layer, fmt};
 
-/// Starts logging. Call once.
-pub fn init(args: &LogArgs) -> Result<(), ParseError> {
-    let filter = EnvFilter::try_new(&args.log)?;
-    let builder = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
-    match args.log_format {
-        LogFormat::Pretty => builder.init(),
-        LogFormat::Json => builder.json().flatten_event(true).init(),
-    }
-    Ok(())
+/// Why nothing can be told.
+#[derive(Debug, thiserror::Error)]
+pub enum TelemetryError {
+    #[error("--log: {0}")]
+    Filter(#[from] ParseError),
+    #[error("traces cannot be sent: {0}; see --otlp-endpoint")]
+    Exporter(#[from] ExporterBuildError),
+}
+
+/// Starts logging and, where that is asked for, tracing. Call once; what is returned sends the last traces.
+pub fn init(log: &LogArgs, traces: &TraceArgs) -> Result<Option<Traces>, TelemetryError> {
+    let filter = EnvFilter::try_new(&log.log)?;
+    let told = fmt::layer().with_writer(std::io::stderr);
+    let told = match log.log_format {
+        LogFormat::Pretty => told.boxed(),
+        LogFormat::Json => told.json().flatten_event(true).boxed(),
+    };
+    // What is traced does not depend on what is logged: this program's spans, and none of its libraries'.
+    let (layer, traces) = traces::layer(traces)?.unzip();
+    let layer = layer.map(|layer| layer.with_filter(Targets::new().with_target("heliomap", LevelFilter::INFO)));
+    tracing_subscriber::registry().with(told.with_filter(filter)).with(layer).init();
+    Ok(traces)
 }

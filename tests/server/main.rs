@@ -1,5 +1,9 @@
 //! The real program.
 
+mod configuration;
+mod doctor;
+mod traces;
+
 use reqwest::StatusCode;
 use reqwest::blocking::Client;
 use serde_json::{Value, json};

@@ -2,6 +2,7 @@
 //! its database by the names `Rows` (the store), `Row` and `Tx` of its parent.
 
 mod access;
+pub mod examine;
 mod read;
 mod requests;
 mod uploads;

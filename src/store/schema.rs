@@ -1,0 +1,58 @@
+//! How a database stands to this program, looked at without changing anything.
+
+use super::StoreError;
+use jiff::Timestamp;
+
+/// How a database's schema stands to this program's.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Schema {
+    /// There are no tables yet.
+    Absent,
+    /// Some changes were not made yet.
+    Behind {
+        missing: usize,
+    },
+    Current,
+    /// A newer version of the program changed it.
+    Ahead,
+}
+
+impl Schema {
+    /// From the changes that this program knows and those that were made.
+    pub(super) fn of(known: impl IntoIterator<Item = i64>, made: &[i64]) -> Self {
+        let known: Vec<i64> = known.into_iter().collect();
+        let missing = known.iter().filter(|version| !made.contains(version)).count();
+        match missing {
+            _ if made.is_empty() => Self::Absent,
+            _ if made.iter().any(|version| !known.contains(version)) => Self::Ahead,
+            0 => Self::Current,
+            missing => Self::Behind { missing },
+        }
+    }
+}
+
+/// A database that was looked at.
+#[derive(Debug)]
+pub struct Examined {
+    pub schema: Schema,
+    /// Whether rows can be written, tried where the schema is current.
+    pub writable: Result<(), StoreError>,
+    /// What its clock says, where it has one of its own.
+    pub now: Option<Timestamp>,
+    /// Whether there is a key.
+    pub has_keys: bool,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn schemas() {
+        assert_eq!(Schema::of([1, 2], &[]), Schema::Absent);
+        assert_eq!(Schema::of([1, 2], &[1]), Schema::Behind { missing: 1 });
+        assert_eq!(Schema::of([1, 2], &[1, 2]), Schema::Current);
+        assert_eq!(Schema::of([1, 2], &[1, 2, 3]), Schema::Ahead);
+        assert_eq!(Schema::of([1, 2], &[1, 3]), Schema::Ahead);
+    }
+}
