@@ -17,7 +17,7 @@ export ORT_DYLIB_PATH ?= $(abspath $(ORT_LIBRARY))
 HELIOMAP_DATA ?= $(wildcard ../shared/data)
 export HELIOMAP_DATA
 
-.PHONY: help setup web demo test lint unit client kills tus contract query load structure bench scaling yolo-export openapi configuration clean
+.PHONY: help setup web demo test lint unit client kills tus contract query load scale-out structure bench scaling yolo-export openapi configuration clean
 
 help: ## List the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -97,6 +97,10 @@ query: setup ## How fast a dashboard is answered about a plant of a million modu
 load: setup ## 50 clients upload at once beside 200 dashboard requests per second: no error, quick answers, little memory
 	$(CARGO) build --release --locked
 	HELIOMAP_BINARY=target/release/heliomap $(PYTHON) tests/load/load.py
+
+scale-out: setup .venv/s3/done ## Two workers on one core each against one, over Postgres and S3 in network namespaces; then one is cut off
+	$(CARGO) build --release --locked
+	$(PYTHON) tests/scale/scale_out.py
 
 structure: setup ## Survey of many simulated plants of every kind, on all cores; fails where too few come out exactly
 	$(CARGO) test --release --locked --no-fail-fast --test structure -- --ignored --nocapture --test-threads 1

@@ -7,15 +7,18 @@ use crate::geometry::PointCloud;
 use crate::layout::{self, Layout, LayoutOptions};
 use crate::plant::assemble::{Identity, assemble};
 use crate::plant::{PlantId, PlantModel, Warning};
-use crate::reconstruction::{self, Photo, PhotoError, Project, ReadError, Shot};
+use crate::reconstruction::{self, Photo, Project, ReadError, Shot};
 use crate::refinement::{self, Control, ControlError, Refined, RefinementOptions};
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 use std::path::Path;
-use std::sync::mpsc::{SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
+
+pub mod search;
+
+pub use search::{Loaded, Sought};
 
 /// Images coarser than this do not resolve modules well enough to be searched, metres per pixel: a module of 1 m is then
 /// 16 pixels wide.
@@ -170,6 +173,24 @@ pub trait Observer: Sync {
     }
     /// Told of what was found in an image, for a later run to recall.
     fn found(&self, _found: &Found) {}
+    /// Told which images are to be searched, in order, so that others may help. Their paths lie in the mapping's folder.
+    fn offer(&self, _images: &[Sought]) {}
+    /// What is next about the images that were offered: `left`, never empty, are those that were not given out here and
+    /// that nobody else has found something in, by their place among the offered, in order.
+    fn next(&self, left: &[usize]) -> Turn {
+        Turn::Search(left[0])
+    }
+}
+
+/// What is next about the images of a mapping, by their place among those that were offered.
+#[derive(Debug, Clone)]
+pub enum Turn {
+    /// This one is to be searched here.
+    Search(usize),
+    /// Someone else has searched this one, as it would have been here.
+    Found(usize, Box<Found>),
+    /// Others are at work on all that are left.
+    Wait,
 }
 
 /// What one image shows.
@@ -289,7 +310,7 @@ pub fn map_folder(
     let seen = match boxes {
         Boxes::Detector(detector) => {
             let chosen = resolving_images(&project, &gsd_m, options, &mut warnings);
-            search_images(&project, &chosen, &gsd_m, detector, &mut clock)?
+            search_images(&project, &chosen, &gsd_m, detector, options.max_image_pixels, &mut clock)?
         }
         Boxes::File(path) => read_boxes(&project, path, &mut clock, &mut warnings)?,
     };
@@ -473,102 +494,75 @@ struct Seen {
     layout: Layout,
 }
 
-/// Images that are searched at once: while one is measured out, the networks have the next.
-const IN_FLIGHT: usize = 2;
-
-/// An image between two steps.
-struct Passed {
-    shot: usize,
-    image: image::RgbImage,
-    detections: ImageDetections,
+impl Seen {
+    fn new(shot: usize, found: Found) -> Self {
+        Self { shot, detections: found.detections, layout: found.layout }
+    }
 }
 
-/// Detects and lays out image by image: while some are searched, the next is decoded and the last is laid out, so that no
-/// more than a few images are in memory at once.
+/// How long the mapping waits before it looks again whether others have found something.
+const WAIT_FOR_OTHERS: Duration = Duration::from_millis(50);
+
+/// Detects and lays out image by image, those apart that an earlier run or others have searched.
 fn search_images(
     project: &Project,
     chosen: &[usize],
     gsd_m: &[Option<f64>],
     detector: &dyn Detector,
+    max_pixels: u64,
     clock: &mut Clock<'_>,
 ) -> Result<Vec<Seen>, MapError> {
     let observer = clock.observer;
     let start = Instant::now();
     let total = chosen.len();
-    let (mut seen, sought): (Vec<Seen>, Vec<usize>) = recalled(project, chosen, observer);
+    let (seen, shots): (Vec<Seen>, Vec<usize>) = recalled(project, chosen, observer);
     observer.progress(Stage::Detect, seen.len(), total);
-    let done = Mutex::new(seen.len());
-    let (decoded_sender, decoded) = sync_channel::<(usize, Result<image::RgbImage, PhotoError>)>(1);
-    let (found_sender, found) = sync_channel::<Passed>(1);
-    // Taken away by the first worker that fails, so that decoding ends, too.
-    let decoded = Mutex::new(Some(decoded));
-    let next = || decoded.lock().unwrap_or_else(PoisonError::into_inner).as_ref()?.recv().ok();
-    let search = |found: &SyncSender<Passed>| -> Result<(), MapError> {
-        while let Some((shot, image)) = next() {
-            if observer.cancelled() {
-                return Err(MapError::Cancelled);
-            }
-            let image = image.map_err(ReadError::Photo)?;
-            let detections = ImageDetections {
-                image: project.reconstruction.shots[shot].name.clone(),
-                width_px: image.width(),
-                height_px: image.height(),
-                detections: detector.detect(&image, gsd_m[shot])?,
-            };
-            if found.send(Passed { shot, image, detections }).is_err() {
-                break;
-            }
-            let mut done = done.lock().unwrap_or_else(PoisonError::into_inner);
-            *done += 1;
-            observer.progress(Stage::Detect, *done, total);
-        }
-        Ok(())
+    let sought: Vec<Sought> = shots
+        .iter()
+        .map(|&shot| {
+            let Photo { shot: image, path, camera, .. } = project.photos[shot].clone();
+            Sought { image, path, camera, gsd_m: gsd_m[shot], max_pixels }
+        })
+        .collect();
+    observer.offer(&sought);
+    let seen = Mutex::new(seen);
+    let keep = |image: usize, found: Found| {
+        let mut seen = seen.lock().unwrap_or_else(PoisonError::into_inner);
+        seen.push(Seen::new(shots[image], found));
+        observer.progress(Stage::Detect, seen.len(), total);
     };
-    let end_decoding = || drop(decoded.lock().unwrap_or_else(PoisonError::into_inner).take());
-    let work = |found: SyncSender<Passed>| search(&found).inspect_err(|_| end_decoding());
-    let unexpected = |what: &str| MapError::Environment { message: format!("{what} an image failed unexpectedly") };
-    let sought = &sought;
-    let (fresh, layout_time) = std::thread::scope(|scope| -> Result<(Vec<Seen>, Duration), MapError> {
-        scope.spawn(move || {
-            for &shot in sought {
-                let image = project.photos[shot].load();
-                if decoded_sender.send((shot, image)).is_err() {
-                    break;
-                }
+    let mut left: Vec<usize> = (0..sought.len()).collect();
+    let next = || loop {
+        if left.is_empty() {
+            return None;
+        }
+        if observer.cancelled() {
+            return Some(Err(MapError::Cancelled));
+        }
+        match observer.next(&left) {
+            Turn::Search(image) => {
+                left.retain(|other| *other != image);
+                let shot = shots[image];
+                let pixels = project.photos[shot].load().map_err(|error| ReadError::Photo(error).into());
+                let name = sought[image].image.clone();
+                return Some(pixels.map(|pixels| Loaded { key: image, image: name, pixels, gsd_m: gsd_m[shot] }));
             }
-        });
-        let laying_out = scope.spawn(move || {
-            let mut seen = Vec::with_capacity(sought.len());
-            let mut spent = Duration::ZERO;
-            for Passed { shot, image, detections } in found {
-                let start = Instant::now();
-                let grey = image::imageops::grayscale(&image);
-                let layout = layout::infer(&detections, Some(&grey), &LayoutOptions::default());
-                let found = Found { detections, layout };
-                observer.found(&found);
-                seen.push(Seen { shot, detections: found.detections, layout: found.layout });
-                spent += start.elapsed();
+            Turn::Found(image, found) => {
+                left.retain(|other| *other != image);
+                keep(image, *found);
             }
-            (seen, spent)
-        });
-        let workers: Vec<_> = (0..IN_FLIGHT)
-            .map(|_| {
-                let (work, found) = (&work, found_sender.clone());
-                scope.spawn(move || work(found))
-            })
-            .collect();
-        drop(found_sender);
-        let outcomes: Vec<Result<(), MapError>> =
-            workers.into_iter().map(|worker| worker.join().unwrap_or_else(|_| Err(unexpected("searching")))).collect();
-        end_decoding();
-        outcomes.into_iter().collect::<Result<(), MapError>>()?;
-        laying_out.join().map_err(|_| unexpected("laying out"))
-    })?;
+            Turn::Wait => std::thread::sleep(WAIT_FOR_OTHERS),
+        }
+    };
+    let found = |image: usize, found: Found| {
+        observer.found(&found);
+        keep(image, found);
+    };
+    let layout_time = search::search(detector, next, found, || observer.cancelled())?;
     // In the order of the shots, whichever was done first.
-    seen.extend(fresh);
+    let mut seen = seen.into_inner().unwrap_or_else(PoisonError::into_inner);
     seen.sort_by_key(|image| image.shot);
-    let wall = start.elapsed();
-    clock.add(Stage::Detect, wall.saturating_sub(layout_time));
+    clock.add(Stage::Detect, start.elapsed().saturating_sub(layout_time));
     clock.add(Stage::Layout, layout_time);
     observer.progress(Stage::Layout, total, total);
     Ok(seen)
@@ -579,7 +573,7 @@ fn recalled(project: &Project, chosen: &[usize], observer: &dyn Observer) -> (Ve
     let (mut seen, mut sought) = (Vec::new(), Vec::new());
     for &shot in chosen {
         match observer.recall(&project.reconstruction.shots[shot].name) {
-            Some(found) => seen.push(Seen { shot, detections: found.detections, layout: found.layout }),
+            Some(found) => seen.push(Seen::new(shot, found)),
             None => sought.push(shot),
         }
     }

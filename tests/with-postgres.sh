@@ -18,7 +18,9 @@ if [ "$(id -u)" = 0 ]; then
 fi
 folder=$(mktemp -d -t heliomap-postgres-XXXXXX)
 [ "$(id -u)" = 0 ] && chown postgres "$folder"
-port=$(python3 -c 'import socket; s = socket.socket(); s.bind(("127.0.0.1", 0)); print(s.getsockname()[1])')
+# An address of the machine's own or, in a network namespace made for a test, of that one.
+address=${HELIOMAP_TEST_LISTEN:-127.0.0.1}
+port=$(python3 -c 'import socket, sys; s = socket.socket(); s.bind((sys.argv[1], 0)); print(s.getsockname()[1])' "$address")
 finish() {
     "${as_user[@]}" "$bin/pg_ctl" --pgdata="$folder/data" --mode=immediate --silent stop >/dev/null 2>&1 || true
     rm -rf "$folder"
@@ -27,8 +29,9 @@ trap finish EXIT
 cd_back=$PWD
 cd "$folder"
 "${as_user[@]}" "$bin/initdb" --pgdata="$folder/data" --username=heliomap --auth=trust --no-sync >"$folder/log" 2>&1 || { cat "$folder/log" >&2; exit 1; }
+echo "host all all $address/24 trust" >>"$folder/data/pg_hba.conf"
 "${as_user[@]}" "$bin/pg_ctl" --pgdata="$folder/data" --log="$folder/data/server.log" --silent --wait \
-    --options="-c listen_addresses=127.0.0.1 -c port=$port -c unix_socket_directories=$folder -c max_connections=300" start >/dev/null
+    --options="-c listen_addresses=$address -c port=$port -c unix_socket_directories=$folder -c max_connections=300" start >/dev/null
 cd "$cd_back"
-export HELIOMAP_TEST_POSTGRES="postgres://heliomap@127.0.0.1:$port"
+export HELIOMAP_TEST_POSTGRES="postgres://heliomap@$address:$port"
 "$@"

@@ -16,10 +16,12 @@ finish() {
     rm -rf "$folder"
 }
 trap finish EXIT
-port=$(python3 -c 'import socket; s = socket.socket(); s.bind(("127.0.0.1", 0)); print(s.getsockname()[1])')
-"$python" -m moto.server --host 127.0.0.1 --port "$port" >"$folder/log" 2>&1 &
+# An address of the machine's own or, in a network namespace made for a test, of that one.
+address=${HELIOMAP_TEST_LISTEN:-127.0.0.1}
+port=$(python3 -c 'import socket, sys; s = socket.socket(); s.bind((sys.argv[1], 0)); print(s.getsockname()[1])' "$address")
+"$python" -m moto.server --host "$address" --port "$port" >"$folder/log" 2>&1 &
 server=$!
-export HELIOMAP_TEST_S3="http://127.0.0.1:$port"
+export HELIOMAP_TEST_S3="http://$address:$port"
 python3 - "$HELIOMAP_TEST_S3/heliomap-tests" <<'END' || { cat "$folder/log" >&2; exit 1; }
 import sys, time, urllib.request
 for _ in range(300):

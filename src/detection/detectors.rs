@@ -24,6 +24,10 @@ impl Detector for Both {
     fn describe(&self) -> String {
         format!("{}; complemented by {}", self.unet.describe(), self.yolo.describe())
     }
+
+    fn identity(&self) -> String {
+        format!("{}; complemented by {}", self.unet.identity(), self.yolo.identity())
+    }
 }
 
 /// Searches an image with the networks that are there. Modules wholly inside it, in its pixels.

@@ -75,6 +75,12 @@ pub trait Detector: Send + Sync {
 
     /// One line for people: which model, which version, what runs it.
     fn describe(&self) -> String;
+
+    /// Tells this detector from every other that may find something else in the same image: the models' digests, and what
+    /// runs them. On how many threads does not matter.
+    fn identity(&self) -> String {
+        self.describe()
+    }
 }
 
 /// Why nothing can be detected. Each sentence says what to do.

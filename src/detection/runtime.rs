@@ -261,6 +261,11 @@ impl ImageModel {
         })
     }
 
+    /// Tells this model and what runs it from every other that may give other numbers.
+    pub fn identity(&self) -> String {
+        format!("{} on {}, {}", self.digest, self.settings.provider.as_str(), ort::info())
+    }
+
     /// The version that the metadata tells, else the beginning of the file's digest.
     pub fn version(&self) -> String {
         self.ours("version").map_or_else(|| self.digest[..12].to_owned(), str::to_owned)

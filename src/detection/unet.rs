@@ -245,6 +245,10 @@ impl Detector for Unet {
     fn describe(&self) -> String {
         format!("U-Net {} ({}), {}", self.version, self.model.name, self.model.settings.describe())
     }
+
+    fn identity(&self) -> String {
+        format!("U-Net {}", self.model.identity())
+    }
 }
 
 /// Tries the network on a small picture: its number of channels, and the pixels of its output per pixel of its input. What

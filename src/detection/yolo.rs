@@ -419,6 +419,10 @@ impl Detector for Yolo {
     fn describe(&self) -> String {
         format!("YOLO {} ({}), {}", self.version, self.model.name, self.model.settings.describe())
     }
+
+    fn identity(&self) -> String {
+        format!("YOLO {}", self.model.identity())
+    }
 }
 
 #[cfg(test)]

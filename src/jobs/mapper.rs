@@ -1,9 +1,9 @@
 //! What a worker runs.
 
 use crate::detection::{DetectionError, Detector};
-use crate::pipeline::{self, Boxes, MapError, MapOptions, Observer, Subject};
+use crate::pipeline::{self, Boxes, Found, Loaded, MapError, MapOptions, Observer, Subject, search};
 use crate::plant::PlantModel;
-use crate::store::Digest;
+use crate::store::{Digest, TaskClaim};
 use std::path::Path;
 use std::sync::{Arc, Mutex, OnceLock};
 
@@ -18,9 +18,19 @@ pub trait Mapper: Send + Sync + 'static {
         observer: &dyn Observer,
     ) -> Result<PlantModel, MapError>;
 
+    /// Searches images of other workers' mappings, as [`search::search`] does, and hands each to `found`.
+    fn search(&self, next: &mut NextTask<'_>, found: &mut FoundInTask<'_>, stop: &Stopped<'_>) -> Result<(), MapError>;
+
     /// Tells this mapper from every other that may find something else in the same images.
     fn identity(&self) -> Result<String, MapError>;
 }
+
+/// Gives the next image of another worker's mapping.
+pub type NextTask<'a> = dyn FnMut() -> Option<Result<Loaded<TaskClaim>, MapError>> + Send + 'a;
+/// Takes what was found in one.
+pub type FoundInTask<'a> = dyn FnMut(TaskClaim, Found) + Send + 'a;
+/// Whether to stop.
+pub type Stopped<'a> = dyn Fn() -> bool + Sync + 'a;
 
 /// The file of a survey whose boxes stand in the place of a detector.
 const BOXES_FILE: &str = "boxes.json";
@@ -74,8 +84,12 @@ impl Mapper for PipelineMapper {
         Ok(mapping.model)
     }
 
+    fn search(&self, next: &mut NextTask<'_>, found: &mut FoundInTask<'_>, stop: &Stopped<'_>) -> Result<(), MapError> {
+        search::search(&*self.detector()?, next, found, stop).map(drop)
+    }
+
     fn identity(&self) -> Result<String, MapError> {
-        Ok(format!("{} {}", program(), self.detector()?.describe()))
+        Ok(format!("{} {}", program(), self.detector()?.identity()))
     }
 }
 

@@ -1,15 +1,18 @@
 //! The queue's workers: a job is one run of the pipeline over a survey. A worker holds no transaction while it
-//! computes: a short claim, a lease with heartbeat, a fenced completion.
+//! computes: a short claim, a lease with heartbeat, a fenced completion. The images of a job are offered to all workers
+//! (`share.rs`), and whoever has no job of its own helps with them (`helper.rs`).
 
 pub mod mapper;
 pub mod readiness;
 pub mod worker;
 
 mod folder;
+mod helper;
 mod rows;
+mod share;
 mod watch;
 
-pub use mapper::{Mapper, PipelineMapper};
+pub use mapper::{FoundInTask, Mapper, NextTask, PipelineMapper, Stopped};
 pub use readiness::{Missing, RECONSTRUCTIONS, is_shot, missing, shots, shots_without_image};
 pub use worker::{Worker, WorkerSettings};
 

@@ -1,11 +1,12 @@
 //! What the mapping thread and the worker tell each other while a job runs.
 
-use crate::pipeline::{Found, Observer, Stage};
+use super::share::Share;
+use crate::pipeline::{Found, Observer, Sought, Stage, Turn};
 use crate::store::{Checkpoint, Progress};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, HashMap};
 use std::sync::atomic::{AtomicU8, Ordering};
-use std::sync::{Mutex, MutexGuard};
+use std::sync::{Mutex, MutexGuard, OnceLock};
 use std::time::Instant;
 use tracing::Span;
 
@@ -57,13 +58,14 @@ struct Findings {
 }
 
 /// One job's progress, findings and stop sign.
-#[derive(Debug)]
 pub struct Watch {
     seen: Mutex<Seen>,
     findings: Mutex<Findings>,
     stop: AtomicU8,
     /// The job's span, that of its stages stand in.
     span: Span,
+    /// How its images are shared with other workers.
+    share: OnceLock<Share>,
 }
 
 fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -73,7 +75,13 @@ fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 impl Default for Watch {
     /// Of a job whose span is the current one.
     fn default() -> Self {
-        Self { seen: Mutex::default(), findings: Mutex::default(), stop: AtomicU8::new(0), span: Span::current() }
+        Self {
+            seen: Mutex::default(),
+            findings: Mutex::default(),
+            stop: AtomicU8::new(0),
+            span: Span::current(),
+            share: OnceLock::new(),
+        }
     }
 }
 
@@ -110,6 +118,11 @@ impl Watch {
             .filter_map(|kept| Some((kept.name.clone(), ciborium::from_reader(kept.document.as_slice()).ok()?)))
             .collect();
         *locked(&self.findings) = Findings { fingerprint, known, fresh: Vec::new(), last };
+    }
+
+    /// Tells how images are shared from now on.
+    pub fn share(&self, share: Share) {
+        let _ = self.share.set(share);
     }
 
     /// What was found since the last time, and under which fingerprint.
@@ -190,6 +203,16 @@ impl Observer for Watch {
         let found = locked(&self.findings).known.remove(image)?;
         locked(&self.seen).recalled += 1;
         Some(found)
+    }
+
+    fn offer(&self, images: &[Sought]) {
+        if self.share.get().is_some_and(|share| !share.offer(images)) {
+            self.stop(Stop::Lost);
+        }
+    }
+
+    fn next(&self, left: &[usize]) -> Turn {
+        self.share.get().map_or(Turn::Search(left[0]), |share| share.next(left))
     }
 
     fn found(&self, found: &Found) {

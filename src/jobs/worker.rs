@@ -1,5 +1,6 @@
 //! A worker: claims a job, maps its survey, hands in the model.
 
+use super::share::Share;
 use super::watch::{Stop, Watch};
 use super::{AttemptError, Mapper, folder, rows};
 use crate::pipeline::{MapError, MapOptions, Subject};
@@ -8,8 +9,9 @@ use crate::store::{Blobs, Claim, Completed, Digest, Ending, FileRecord, Heartbea
 use crate::telemetry::Metrics;
 use crate::telemetry::metrics::OutcomeLabels;
 use jiff::Timestamp;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
+use tokio::runtime::Handle;
 use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
@@ -48,7 +50,8 @@ fn fingerprint(files: &[FileRecord], options: &str, mapper: &str) -> String {
     Digest::of(serde_json::json!([files, options, mapper]).to_string().as_bytes()).to_string()
 }
 
-/// Runs jobs one after the other.
+/// Runs jobs one after the other, and helps others with theirs in between.
+#[derive(Clone)]
 pub struct Worker {
     pub name: String,
     pub store: Arc<dyn Store>,
@@ -71,7 +74,17 @@ impl Worker {
                     self.work(claim, &stop).instrument(span).await;
                     continue;
                 }
-                Ok(None) => self.settings.poll,
+                Ok(None) => match self.help(&stop).await {
+                    Ok(0) => self.settings.poll,
+                    Ok(images) => {
+                        tracing::info!(images, "helped with the images of other workers' jobs");
+                        continue;
+                    }
+                    Err(error) => {
+                        tracing::error!(%error, "cannot help with the images of other workers' jobs");
+                        self.settings.poll * 4
+                    }
+                },
                 Err(error) => {
                     tracing::error!(%error, "cannot look for jobs");
                     self.settings.poll * 4
@@ -123,7 +136,10 @@ impl Worker {
                 () = stop.cancelled(), if watch.stopped().is_none() => watch.stop(Stop::Shutdown),
             }
             self.keep(claim, watch).await;
-            match self.store.heartbeat(claim, watch.progress(), self.settings.lease, Timestamp::now()).await {
+            let heartbeat = self.store.heartbeat(claim, watch.progress(), self.settings.lease, Timestamp::now());
+            // Who is cut off gets no answer, not even that.
+            let answer = tokio::time::timeout(self.settings.lease, heartbeat).await;
+            match answer.unwrap_or(Err(StoreError::Silent)) {
                 Ok(answer) => {
                     heard = Instant::now();
                     match answer {
@@ -154,7 +170,8 @@ impl Worker {
         if found.is_empty() {
             return;
         }
-        match self.store.checkpoint(claim, &fingerprint, &found).await {
+        let kept = tokio::time::timeout(self.settings.lease, self.store.checkpoint(claim, &fingerprint, &found)).await;
+        match kept.unwrap_or(Err(StoreError::Silent)) {
             Ok(true) => {}
             Ok(false) => watch.stop(Stop::Lost),
             Err(error) => tracing::warn!(%error, "what was found so far cannot be kept"),
@@ -191,8 +208,18 @@ impl Worker {
             tracing::info!(images = known.len(), "the job goes on where it was");
         }
         let pace = self.store.last_stage_ms().await?;
-        watch.begin(fingerprint, &known, pace.and_then(|text| serde_json::from_str(&text).ok()));
+        watch.begin(fingerprint.clone(), &known, pace.and_then(|text| serde_json::from_str(&text).ok()));
         let folder = folder::lay_out(&self.blobs, job.plant, &files).await?;
+        watch.share(Share {
+            store: self.store.clone(),
+            claim: claim.clone(),
+            fingerprint,
+            mapper: identity,
+            digests: Share::digests(&files),
+            folder: folder.path().to_owned(),
+            runtime: Handle::current(),
+            state: Mutex::default(),
+        });
 
         let (mapper, observer) = (self.mapper.clone(), watch.clone());
         let span = tracing::Span::current();

@@ -13,6 +13,7 @@ pub mod schema;
 pub mod secret;
 pub mod sqlite;
 pub mod survey_path;
+pub mod tasks;
 pub mod uploads;
 pub mod usage;
 pub mod webhooks;
@@ -32,6 +33,7 @@ pub use requests::RequestStore;
 pub use secret::Secret;
 pub use sqlite::SqliteStore;
 pub use survey_path::{Content, FileKind, ImageName, InvalidPath, SurveyPath};
+pub use tasks::{GivenBack, ImageTask, OwnTask, TaskClaim, TaskStore};
 
 pub use uploads::{Upload, UploadId, UploadStore};
 pub use usage::{Quotas, Usage, UsageStore};
@@ -56,6 +58,9 @@ pub enum StoreError {
     /// The database failed.
     #[error("database: {0}")]
     Database(#[from] sqlx::Error),
+    /// The database did not answer in time.
+    #[error("the database does not answer")]
+    Silent,
     /// The database's schema could not be brought up to date.
     #[error("database schema: {0}")]
     Migration(#[from] sqlx::migrate::MigrateError),
@@ -89,7 +94,7 @@ impl StoreError {
 
 /// The rows. Absence is `Ok(None)`; the time comes in from the caller.
 #[async_trait::async_trait]
-pub trait Store: AccessStore + UploadStore + RequestStore + WebhookStore + UsageStore {
+pub trait Store: AccessStore + UploadStore + RequestStore + TaskStore + WebhookStore + UsageStore {
     /// Fails where the database does not answer.
     async fn ping(&self) -> Result<(), StoreError>;
 

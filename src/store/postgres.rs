@@ -19,6 +19,11 @@ const ACQUIRE_TIMEOUT: Duration = Duration::from_secs(20);
 const MAX_CONNECTIONS: u32 = 10;
 /// Milliseconds since 1970 by the server's clock.
 const CLOCK: Option<&str> = Some("SELECT CAST(EXTRACT(EPOCH FROM clock_timestamp()) * 1000 AS BIGINT)");
+/// Where a process is cut off, the server ends its sessions and what they have locked after half a minute: by itself it
+/// would wait for hours.
+const LET_GO: &str = "\
+    SET idle_in_transaction_session_timeout = '30s'; SET tcp_keepalives_idle = 15; \
+    SET tcp_keepalives_interval = 5; SET tcp_keepalives_count = 3";
 /// The lock under which jobs are queued and claimed: any number, as long as nothing else in the database takes it.
 const QUEUE_LOCK: i64 = 0x6865_6c69_6f6d_6170;
 
@@ -33,6 +38,9 @@ impl PostgresStore {
     /// Opens the database at a URL and brings its schema up to date, one process at a time.
     pub async fn open(url: &str) -> Result<Self, StoreError> {
         let options = PgPoolOptions::new().max_connections(MAX_CONNECTIONS).acquire_timeout(ACQUIRE_TIMEOUT);
+        let options = options.after_connect(|connection, _| {
+            Box::pin(async move { sqlx::raw_sql(LET_GO).execute(&mut *connection).await.map(drop) })
+        });
         let pool = options.connect(url).await?;
         sqlx::migrate!("migrations/postgres").run(&pool).await?;
         Ok(Self { read: pool.clone(), write: pool })

@@ -189,6 +189,8 @@ pub struct Queue {
     pub waiting: u64,
     /// How long the oldest of these has been waiting.
     pub oldest: Option<Duration>,
+    /// How many images of running jobs wait for a worker to help.
+    pub images: u64,
 }
 
 /// Connections to the database.

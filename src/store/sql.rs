@@ -292,10 +292,52 @@ pub const CHECKPOINT: &str = "\
     ON CONFLICT (job_id, name) DO UPDATE SET fingerprint = excluded.fingerprint, document = excluded.document";
 pub const CHECKPOINTS: &str =
     "SELECT name, document FROM checkpoints WHERE job_id = $1 AND fingerprint = $2 ORDER BY name";
-/// What ended jobs had found is in their models, or of no use.
 pub const SWEEP_CHECKPOINTS: &str = "\
     DELETE FROM checkpoints WHERE NOT EXISTS (SELECT 1 FROM jobs WHERE jobs.id = checkpoints.job_id \
     AND jobs.state IN ('queued', 'running'))";
+
+pub const IS_CLAIMED: &str = "SELECT 1 FROM jobs WHERE id = $1 AND fence = $2 AND state = 'running'";
+pub const WITHDRAW_TASKS: &str = "DELETE FROM image_tasks WHERE job_id = $1";
+pub const OFFER_TASK: &str = "\
+    INSERT INTO image_tasks (job_id, image, position, fingerprint, mapper, document) VALUES ($1, $2, $3, $4, $5, $6)";
+/// The job's own worker has it for as long as it has the job: `$4` is the end of time.
+pub const TAKE_OWN_TASK: &str = "\
+    UPDATE image_tasks SET token = NULL, lease_until_ms = $4 WHERE job_id = $1 AND image = (\
+        SELECT free.image FROM image_tasks AS free \
+        WHERE free.job_id = $1 AND NOT free.done AND free.lease_until_ms < $3 ORDER BY free.position LIMIT 1\
+    ) AND EXISTS (SELECT 1 FROM jobs WHERE id = $1 AND fence = $2 AND state = 'running') RETURNING image";
+pub const TASK_IN_OTHER_HANDS: &str =
+    "SELECT 1 FROM image_tasks WHERE job_id = $1 AND (done OR lease_until_ms < $2) LIMIT 1";
+pub const DONE_TASK: &str = "SELECT 1 FROM image_tasks WHERE job_id = $1 AND done LIMIT 1";
+pub const GATHER_TASKS: &str = "\
+    DELETE FROM image_tasks WHERE job_id = $1 AND done \
+    AND EXISTS (SELECT 1 FROM jobs WHERE id = $1 AND fence = $2 AND state = 'running') RETURNING image";
+pub const ONE_CHECKPOINT: &str = "SELECT document FROM checkpoints WHERE job_id = $1 AND name = $2";
+pub const WAITING_TASKS: &str = "\
+    SELECT COUNT(*) FROM image_tasks WHERE NOT done AND NOT left_to_owner AND lease_until_ms < $1 \
+    AND EXISTS (SELECT 1 FROM jobs WHERE jobs.id = image_tasks.job_id AND jobs.state = 'running' \
+    AND NOT jobs.cancel_requested)";
+pub const TAKE_TASK: &str = "\
+    UPDATE image_tasks SET token = $3, lease_until_ms = $4 WHERE (job_id, image) = (\
+        SELECT free.job_id, free.image FROM image_tasks AS free JOIN jobs ON jobs.id = free.job_id \
+        WHERE free.mapper = $1 AND NOT free.done AND NOT free.left_to_owner AND free.lease_until_ms < $2 \
+        AND jobs.state = 'running' AND NOT jobs.cancel_requested \
+        ORDER BY jobs.priority DESC, jobs.seq, free.position LIMIT 1\
+    ) RETURNING job_id, image, document, (SELECT plant_id FROM jobs WHERE jobs.id = image_tasks.job_id) AS plant_id";
+pub const EXTEND_TASK: &str = "\
+    UPDATE image_tasks SET lease_until_ms = $2 WHERE token = $1 AND EXISTS (SELECT 1 FROM jobs \
+    WHERE jobs.id = image_tasks.job_id AND jobs.state = 'running' AND NOT jobs.cancel_requested)";
+pub const FINISH_TASK: &str = "\
+    UPDATE image_tasks SET done = TRUE, token = NULL, lease_until_ms = $2 WHERE token = $1 RETURNING fingerprint";
+pub const OTHERS_MADE_PROGRESS: &str =
+    "UPDATE jobs SET attempts_before = attempt - 1 WHERE id = $1 AND state = 'running'";
+pub const GIVE_BACK_TASK: &str = "\
+    UPDATE image_tasks SET token = NULL, lease_until_ms = 0, left_to_owner = (left_to_owner OR $2) WHERE token = $1";
+pub const FORGET_TASK: &str = "DELETE FROM image_tasks WHERE job_id = $1 AND image = $2";
+pub const SWEEP_TASKS: &str = "\
+    DELETE FROM image_tasks WHERE NOT EXISTS (SELECT 1 FROM jobs WHERE jobs.id = image_tasks.job_id \
+    AND jobs.state IN ('queued', 'running'))";
+
 pub const ATTEMPTS_USED: &str =
     "SELECT attempt - attempts_before FROM jobs WHERE id = $1 AND fence = $2 AND state = 'running'";
 pub const LAST_STAGE_MS: &str = "SELECT stage_ms FROM jobs WHERE stage_ms IS NOT NULL ORDER BY seq DESC LIMIT 1";

@@ -68,11 +68,14 @@ pub struct Metrics {
     pub upload_bytes: Counter,
     /// Attempts at jobs, by how they ended.
     pub attempts: Family<OutcomeLabels, Counter>,
+    /// Images of other workers' jobs that this one searched.
+    pub images_helped: Counter,
     pub stage_seconds: Family<StageLabels, Histogram, fn() -> Histogram>,
     /// Messages to webhooks, by what became of them.
     pub deliveries: Family<OutcomeLabels, Counter>,
     jobs: Family<StateLabels, Gauge>,
     queue_depth: Gauge,
+    images_waiting: Gauge,
     queue_age_seconds: Seconds,
     connections: Family<PoolLabels, Gauge>,
     disk_free_bytes: Gauge,
@@ -89,10 +92,12 @@ impl Default for Metrics {
             requests_in_flight: Gauge::default(),
             upload_bytes: Counter::default(),
             attempts: Family::default(),
+            images_helped: Counter::default(),
             stage_seconds: Family::new_with_constructor(works),
             deliveries: Family::default(),
             jobs: Family::default(),
             queue_depth: Gauge::default(),
+            images_waiting: Gauge::default(),
             queue_age_seconds: Gauge::default(),
             connections: Family::default(),
             disk_free_bytes: Gauge::default(),
@@ -108,6 +113,11 @@ impl Default for Metrics {
         );
         registry.register("requests_in_flight", "Requests being answered", metrics.requests_in_flight.clone());
         registry.register_with_unit("upload", "Bytes of uploads that came", Unit::Bytes, metrics.upload_bytes.clone());
+        registry.register(
+            "images_helped",
+            "Images of other workers' jobs that were searched here",
+            metrics.images_helped.clone(),
+        );
         registry.register("job_attempts", "Attempts at jobs by how they ended", metrics.attempts.clone());
         registry.register_with_unit(
             "stage",
@@ -119,6 +129,11 @@ impl Default for Metrics {
         registry.register("webhook_deliveries", "Messages sent to webhooks by what became of them", deliveries);
         registry.register("jobs", "Jobs by state, whoever's and whichever process's", metrics.jobs.clone());
         registry.register("queue_depth", "Jobs that wait for a worker", metrics.queue_depth.clone());
+        registry.register(
+            "images_waiting",
+            "Images of running jobs that wait for a worker to help",
+            metrics.images_waiting.clone(),
+        );
         registry.register_with_unit(
             "queue_age",
             "How long the oldest job that waits has been waiting",
@@ -161,6 +176,7 @@ impl Metrics {
             self.jobs.get_or_create(&StateLabels { state: state.as_str() }).set(count as i64);
         }
         self.queue_depth.set(queue.waiting as i64);
+        self.images_waiting.set(queue.images as i64);
         self.queue_age_seconds.set(queue.oldest.map_or(0.0, |age| age.as_secs_f64()));
         for pool in store.pools() {
             for (state, count) in [("idle", pool.idle), ("used", pool.open.saturating_sub(pool.idle))] {

@@ -5,7 +5,7 @@ use heliomap::config::{Limits, NetworkArgs};
 use heliomap::detection::{Detector, ImageDetections};
 use heliomap::geometry::{GeodeticReference, Lla};
 use heliomap::http::{AppState, router, serve};
-use heliomap::jobs::{Mapper, PipelineMapper, Worker, WorkerSettings};
+use heliomap::jobs::{FoundInTask, Mapper, NextTask, PipelineMapper, Stopped, Worker, WorkerSettings};
 use heliomap::pipeline::{Found, MapError, MapOptions, Observer, Stage, Subject};
 use heliomap::plant::{
     Bench, BenchId, Line, LineId, Module, ModuleId, ModuleStatus, PlantId, PlantModel, Sector, SectorId, Warning,
@@ -105,6 +105,14 @@ impl Mapper for ScriptedMapper {
         }
     }
 
+    fn search(&self, next: &mut NextTask<'_>, found: &mut FoundInTask<'_>, _: &Stopped<'_>) -> Result<(), MapError> {
+        while let Some(image) = next() {
+            let image = image?;
+            found(image.key, nothing_in(&image.image));
+        }
+        Ok(())
+    }
+
     fn identity(&self) -> Result<String, MapError> {
         Ok("scripted".to_owned())
     }
@@ -196,6 +204,18 @@ pub struct App {
     _stop: DropGuard,
 }
 
+/// A worker in a hurry.
+fn worker(store: Arc<dyn Store>, blobs: Blobs, mapper: Arc<dyn Mapper>) -> Worker {
+    let settings = WorkerSettings {
+        lease: Duration::from_secs(10),
+        heartbeat: Duration::from_millis(10),
+        poll: Duration::from_millis(20),
+        backoff: Duration::from_millis(10),
+    };
+    let (name, metrics, bell) = ("test".to_owned(), Metrics::default(), Arc::default());
+    Worker { name, store, blobs, mapper, settings, metrics, bell }
+}
+
 /// A service over what another one has stored, which lives at least as long.
 pub struct Beside<'a> {
     app: App,
@@ -278,6 +298,19 @@ impl App {
         self.blobs.clone()
     }
 
+    /// Starts another worker, which works until the service stops or the answer is cancelled.
+    pub fn work(&self, mapper: Arc<dyn Mapper>) -> CancellationToken {
+        self.work_with(self.blobs.clone(), mapper)
+    }
+
+    /// Starts another worker with blobs of its own.
+    pub fn work_with(&self, blobs: Blobs, mapper: Arc<dyn Mapper>) -> CancellationToken {
+        let (worker, stop) = (worker(self.store.clone(), blobs, mapper), self.cancelled.child_token());
+        let told = stop.clone();
+        tokio::spawn(async move { worker.run(told).await });
+        stop
+    }
+
     /// Tells the service to stop.
     pub fn stop(&self) {
         self.cancelled.cancel();
@@ -335,21 +368,8 @@ impl App {
         let blobs = Blobs::in_folder(folder.path()).unwrap();
         let (bell, metrics) = (Arc::new(Notify::new()), Metrics::default());
         if let Some(mapper) = working {
-            let worker = Worker {
-                name: "test".to_owned(),
-                store: store.clone(),
-                blobs: blobs.clone(),
-                mapper,
-                settings: WorkerSettings {
-                    lease: Duration::from_secs(10),
-                    heartbeat: Duration::from_millis(10),
-                    poll: Duration::from_millis(20),
-                    backoff: Duration::from_millis(10),
-                },
-                metrics: metrics.clone(),
-                bell: bell.clone(),
-            };
-            let stop = cancelled.clone();
+            let worker = worker(store.clone(), blobs.clone(), mapper);
+            let (worker, stop) = (Worker { metrics: metrics.clone(), bell: bell.clone(), ..worker }, cancelled.clone());
             tokio::spawn(async move { worker.run(stop).await });
         }
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();

@@ -26,13 +26,13 @@ fn photo(number: u8) -> Vec<u8> {
 }
 
 /// Knows photos by their shade, and what is in them.
-struct Knowing {
+pub struct Knowing {
     boxes: BTreeMap<u8, Vec<Detection>>,
 }
 
 impl Knowing {
     /// The modules of the example plant that `keep` is true for.
-    fn new(keep: impl Fn(&Value) -> bool) -> Arc<Self> {
+    pub fn new(keep: impl Fn(&Value) -> bool) -> Arc<Self> {
         let mut boxes = BTreeMap::new();
         for image in true_boxes(keep)["images"].as_array().unwrap() {
             let number = image["image"].as_str().unwrap()["DJI_".len()..][..4].parse().unwrap();
@@ -59,11 +59,11 @@ impl Detector for Knowing {
 }
 
 /// The files of a survey.
-struct Files(BTreeMap<String, Vec<u8>>);
+pub struct Files(BTreeMap<String, Vec<u8>>);
 
 impl Files {
     /// Of the example plant, with its sparse points only.
-    fn new() -> Self {
+    pub fn new() -> Self {
         let mut files = BTreeMap::new();
         for name in ["reconstruction.json", "reference_lla.json"] {
             files.insert(name.to_owned(), std::fs::read(Path::new(EXAMPLE).join(name)).unwrap());
@@ -102,7 +102,7 @@ impl Files {
         archive.into_inner().unwrap()
     }
 
-    async fn upload(&self, app: &App) -> String {
+    pub async fn upload(&self, app: &App) -> String {
         static PLANTS: AtomicU32 = AtomicU32::new(0);
         let name = format!("Plant {}", PLANTS.fetch_add(1, Ordering::Relaxed));
         let (_, plant) = app.post("/api/v1/plants", json!({"name": name})).await;

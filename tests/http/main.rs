@@ -14,6 +14,7 @@ mod models;
 mod plants;
 mod quotas;
 mod reconstruction;
+mod sharing;
 mod tenants;
 mod tus;
 mod verdicts;

@@ -68,6 +68,9 @@ on_both!(
     quotas,
     webhooks,
     messages_are_sent_by_one_at_a_time_and_not_for_ever,
+    images_of_a_job_are_shared,
+    images_in_silent_hands_come_back,
+    images_go_with_their_job,
 );
 
 /// A data folder of before there were organisations keeps all that it holds.

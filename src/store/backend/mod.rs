@@ -5,6 +5,7 @@ mod access;
 pub mod examine;
 mod read;
 mod requests;
+mod tasks;
 mod uploads;
 mod usage;
 mod webhooks;
@@ -14,6 +15,7 @@ use super::super::{
     Cancelled, Checkpoint, Claim, Completed, Created, Digest, Ending, Enqueued, Feature, FeatureQuery, FileRecord,
     FileWritten, GeoBox, Heartbeat, Job, JobId, JobRequest, JobState, LayerInfo, Model, NewFeature, NewModel,
     OrganisationId, Page, Plant, Pool, Progress, Queue, Quotas, Store, StoreError, Survey, SurveyId, SurveyPath,
+    TaskStore,
 };
 use super::{Row, Rows, Tx};
 use crate::plant::{Layer, ModuleId, PlantId};
@@ -267,7 +269,7 @@ impl Store for Rows {
         let row = query.bind(now.as_millisecond()).fetch_optional(&mut *tx).await?;
         let outcome = match row {
             Some(row) => {
-                sqlx::query(sql::SWEEP_CHECKPOINTS).execute(&mut *tx).await?;
+                sweep(&mut tx).await?;
                 let job = job(&row)?;
                 if job.state.is_final() {
                     announce(&mut tx, id, now).await?;
@@ -296,7 +298,8 @@ impl Store for Rows {
         let row = sqlx::query(sql::QUEUE).bind(now.as_millisecond()).fetch_one(&self.read).await?;
         let since_ms: Option<i64> = row.try_get("since_ms")?;
         let age = |since_ms: i64| Duration::from_millis(now.as_millisecond().saturating_sub(since_ms).max(0) as u64);
-        Ok(Queue { jobs, waiting: row.try_get::<i64, _>("waiting")? as u64, oldest: since_ms.map(age) })
+        let images = self.waiting_tasks(now).await?;
+        Ok(Queue { jobs, waiting: row.try_get::<i64, _>("waiting")? as u64, oldest: since_ms.map(age), images })
     }
 
     fn pools(&self) -> Vec<Pool> {
@@ -312,7 +315,7 @@ impl Store for Rows {
             .fetch_all(&mut *tx)
             .await?;
         if !buried.is_empty() {
-            sqlx::query(sql::SWEEP_CHECKPOINTS).execute(&mut *tx).await?;
+            sweep(&mut tx).await?;
         }
         for row in &buried {
             announce(&mut tx, JobId(read::uuid(row, "id")?), now).await?;
@@ -367,6 +370,8 @@ impl Store for Rows {
                 .bind(&checkpoint.document)
                 .execute(&mut *tx)
                 .await?;
+            let query = sqlx::query(sql::FORGET_TASK).bind(claim.job.id.to_string()).bind(&checkpoint.name);
+            query.execute(&mut *tx).await?;
         }
         tx.commit().await?;
         Ok(true)
@@ -434,7 +439,7 @@ impl Store for Rows {
                 insert_feature(&mut tx, stored.seq, layer.layer, index as i64 + 1, feature).await?;
             }
         }
-        sqlx::query(sql::SWEEP_CHECKPOINTS).execute(&mut *tx).await?;
+        sweep(&mut tx).await?;
         announce(&mut tx, claim.job.id, now).await?;
         tx.commit().await?;
         Ok(Completed::Done(Box::new(stored)))
@@ -470,7 +475,7 @@ impl Store for Rows {
             .bind(attempts_back)
             .execute(&mut *tx)
             .await?;
-        sqlx::query(sql::SWEEP_CHECKPOINTS).execute(&mut *tx).await?;
+        sweep(&mut tx).await?;
         if finished_ms.is_some() {
             announce(&mut tx, claim.job.id, now).await?;
         }
@@ -556,6 +561,14 @@ impl Store for Rows {
         let version: Option<i64> = query.fetch_optional(&self.read).await?;
         version.map(|version| read::small("version", version)).transpose()
     }
+}
+
+/// What ended jobs had found is in their models, or of no use; their images need no search.
+async fn sweep(tx: &mut Tx) -> Result<(), StoreError> {
+    for statement in [sql::SWEEP_CHECKPOINTS, sql::SWEEP_TASKS] {
+        sqlx::query(statement).execute(&mut **tx).await?;
+    }
+    Ok(())
 }
 
 async fn insert_feature(

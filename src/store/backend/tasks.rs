@@ -1,0 +1,150 @@
+//! Images of running jobs that other workers may search.
+
+use super::super::Rows;
+use super::{after, read};
+use crate::plant::PlantId;
+use crate::store::{Checkpoint, Claim, GivenBack, ImageTask, JobId, OwnTask, StoreError, TaskClaim, TaskStore, sql};
+use async_trait::async_trait;
+use jiff::Timestamp;
+use sqlx::Row as _;
+use std::time::Duration;
+use uuid::Uuid;
+
+#[async_trait]
+impl TaskStore for Rows {
+    async fn offer_tasks(
+        &self,
+        claim: &Claim,
+        fingerprint: &str,
+        mapper: &str,
+        tasks: &[ImageTask],
+    ) -> Result<bool, StoreError> {
+        let mut tx = self.begin_alone().await?;
+        let job = claim.job.id.to_string();
+        let held = sqlx::query(sql::IS_CLAIMED).bind(&job).bind(claim.fence).fetch_optional(&mut *tx).await?;
+        if held.is_none() {
+            return Ok(false);
+        }
+        sqlx::query(sql::WITHDRAW_TASKS).bind(&job).execute(&mut *tx).await?;
+        for (position, task) in tasks.iter().enumerate() {
+            sqlx::query(sql::OFFER_TASK)
+                .bind(&job)
+                .bind(&task.image)
+                .bind(position as i64)
+                .bind(fingerprint)
+                .bind(mapper)
+                .bind(&task.document)
+                .execute(&mut *tx)
+                .await?;
+        }
+        tx.commit().await?;
+        Ok(true)
+    }
+
+    async fn take_own_task(&self, claim: &Claim, now: Timestamp) -> Result<OwnTask, StoreError> {
+        let mut tx = self.begin_alone().await?;
+        let job = claim.job.id.to_string();
+        let image: Option<String> = sqlx::query_scalar(sql::TAKE_OWN_TASK)
+            .bind(&job)
+            .bind(claim.fence)
+            .bind(now.as_millisecond())
+            .bind(i64::MAX)
+            .fetch_optional(&mut *tx)
+            .await?;
+        let own = match image {
+            Some(image) => OwnTask::Image(image),
+            None => {
+                let query = sqlx::query(sql::TASK_IN_OTHER_HANDS).bind(&job).bind(i64::MAX);
+                match query.fetch_optional(&mut *tx).await? {
+                    Some(_) => OwnTask::InOtherHands,
+                    None => OwnTask::None,
+                }
+            }
+        };
+        tx.commit().await?;
+        Ok(own)
+    }
+
+    async fn gather_tasks(&self, claim: &Claim) -> Result<Vec<Checkpoint>, StoreError> {
+        let job = claim.job.id.to_string();
+        // Most of the time there is nothing, and nobody is to wait for that.
+        if sqlx::query(sql::DONE_TASK).bind(&job).fetch_optional(&self.read).await?.is_none() {
+            return Ok(Vec::new());
+        }
+        let mut tx = self.begin().await?;
+        let query = sqlx::query_scalar(sql::GATHER_TASKS).bind(&job).bind(claim.fence);
+        let images: Vec<String> = query.fetch_all(&mut *tx).await?;
+        let mut found = Vec::with_capacity(images.len());
+        for name in images {
+            let query = sqlx::query_scalar(sql::ONE_CHECKPOINT).bind(&job).bind(&name);
+            if let Some(document) = query.fetch_optional(&mut *tx).await? {
+                found.push(Checkpoint { name, document });
+            }
+        }
+        tx.commit().await?;
+        Ok(found)
+    }
+
+    async fn waiting_tasks(&self, now: Timestamp) -> Result<u64, StoreError> {
+        let query = sqlx::query_scalar::<_, i64>(sql::WAITING_TASKS).bind(now.as_millisecond());
+        Ok(query.fetch_one(&self.read).await? as u64)
+    }
+
+    async fn take_task(&self, mapper: &str, lease: Duration, now: Timestamp) -> Result<Option<TaskClaim>, StoreError> {
+        let mut tx = self.begin_alone().await?;
+        let token = Uuid::new_v4();
+        let row = sqlx::query(sql::TAKE_TASK)
+            .bind(mapper)
+            .bind(now.as_millisecond())
+            .bind(token.to_string())
+            .bind(after(now, lease))
+            .fetch_optional(&mut *tx)
+            .await?;
+        tx.commit().await?;
+        row.map(|row| {
+            Ok(TaskClaim {
+                plant: PlantId(read::uuid(&row, "plant_id")?),
+                job: JobId(read::uuid(&row, "job_id")?),
+                task: ImageTask { image: row.try_get("image")?, document: row.try_get("document")? },
+                token,
+            })
+        })
+        .transpose()
+    }
+
+    async fn extend_tasks(&self, tokens: &[Uuid], lease: Duration, now: Timestamp) -> Result<Vec<Uuid>, StoreError> {
+        let mut tx = self.begin().await?;
+        let mut held = Vec::with_capacity(tokens.len());
+        for token in tokens {
+            let query = sqlx::query(sql::EXTEND_TASK).bind(token.to_string()).bind(after(now, lease));
+            if query.execute(&mut *tx).await?.rows_affected() > 0 {
+                held.push(*token);
+            }
+        }
+        tx.commit().await?;
+        Ok(held)
+    }
+
+    async fn finish_task(&self, claim: &TaskClaim, document: &[u8]) -> Result<bool, StoreError> {
+        let mut tx = self.begin().await?;
+        let query = sqlx::query_scalar(sql::FINISH_TASK).bind(claim.token.to_string()).bind(i64::MAX);
+        let Some(fingerprint) = query.fetch_optional(&mut *tx).await? else { return Ok(false) };
+        let fingerprint: String = fingerprint;
+        sqlx::query(sql::CHECKPOINT)
+            .bind(claim.job.to_string())
+            .bind(&claim.task.image)
+            .bind(fingerprint)
+            .bind(document)
+            .execute(&mut *tx)
+            .await?;
+        sqlx::query(sql::OTHERS_MADE_PROGRESS).bind(claim.job.to_string()).execute(&mut *tx).await?;
+        tx.commit().await?;
+        Ok(true)
+    }
+
+    async fn give_back_task(&self, claim: &TaskClaim, to: GivenBack) -> Result<(), StoreError> {
+        let query = sqlx::query(sql::GIVE_BACK_TASK).bind(claim.token.to_string());
+        query.bind(to == GivenBack::ToOwner).execute(&self.write).await?;
+        Ok(())
+    }
+}
