@@ -128,14 +128,16 @@ fn empty_columns(pieces: &[LocatedPiece], clusters: &Clusters, members: &[usize]
     splits
 }
 
-/// The pieces with those of `splits` cut in two, both ends at the cut closed.
+/// The pieces with those of `splits`, which are sorted, cut in two, both ends at the cut closed.
 pub fn split(pieces: Vec<LocatedPiece>, splits: &[Split]) -> Vec<LocatedPiece> {
     let mut result = Vec::with_capacity(pieces.len() + splits.len());
+    let mut splits = splits.chunk_by(|a, b| a.piece == b.piece).peekable();
     for (index, piece) in pieces.into_iter().enumerate() {
+        let own = splits.next_if(|own| own[0].piece == index).unwrap_or_default();
         let mut rest = Some(piece);
         // Column of the original piece at which `rest` begins.
         let mut start = 0;
-        for split in splits.iter().filter(|split| split.piece == index) {
+        for split in own {
             let Some(current) = rest.take() else { break };
             let after = split.after_col - start;
             if after < -1 {

@@ -438,6 +438,7 @@ fn join(
     options: &LayoutOptions,
 ) {
     grown.sort_by_key(|component| std::cmp::Reverse(component.places.len()));
+    let mut sides: Vec<[Vector2<f64>; 2]> = grown.iter().map(|component| component.sides(nodes)).collect();
     let mut index = 0;
     while index < grown.len() {
         if grown[index].places.len() < 2 {
@@ -446,7 +447,8 @@ fn join(
         let mut map = grown[index].map(nodes);
         let mut other = index + 1;
         while other < grown.len() {
-            let joined = attachment(&grown[index], &map, &grown[other], nodes, options).filter(|join| {
+            let (base, part) = ((&grown[index], sides[index]), (&grown[other], sides[other]));
+            let joined = attachment(base, &map, part, nodes, options).filter(|join| {
                 join.missing == 0 || bridge_is_sound(join, &grown[index], &map, grey, detections, nodes)
             });
             let Some(attach) = joined else {
@@ -454,6 +456,7 @@ fn join(
                 continue;
             };
             let part = grown.remove(other);
+            sides.remove(other);
             let base = &mut grown[index];
             for ((col, row), node) in &part.places {
                 let (u, v) = turned(*col, *row, attach.turn);
@@ -464,6 +467,7 @@ fn join(
                 base.bridges.push(attach.bridge);
             }
             map = base.map(nodes);
+            sides[index] = base.sides(nodes);
             // What failed before may fit the longer lattice.
             other = index + 1;
         }
@@ -492,16 +496,14 @@ struct Attachment {
     bridge: i32,
 }
 
-/// How `part` stands in the lattice of `base`, if it does.
+/// How `part` stands in the lattice of `base`, if it does; each with its module's sides.
 fn attachment(
-    base: &Component,
+    (base, base_sides): (&Component, [Vector2<f64>; 2]),
     map: &LatticeMap,
-    part: &Component,
+    (part, part_sides): (&Component, [Vector2<f64>; 2]),
     nodes: &[Node],
     options: &LayoutOptions,
 ) -> Option<Attachment> {
-    let base_sides = base.sides(nodes);
-    let part_sides = part.sides(nodes);
     let directions = [part_sides[0], part_sides[1], -part_sides[0], -part_sides[1]];
     let turn = (0..4).max_by(|&s, &t| {
         let cosine = |k: usize| base_sides[0].dot(&directions[k]) / directions[k].norm();

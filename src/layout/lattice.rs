@@ -1,7 +1,12 @@
 //! A smooth map from lattice coordinates to the image: where the module of a column and row stands.
 
-use nalgebra::{DMatrix, DVector, Vector2};
+use nalgebra::{SMatrix, Vector2};
 use serde::{Deserialize, Serialize};
+
+/// Terms of the longest map, and the powers that are in it.
+const MOST_TERMS: usize = 7;
+/// A fit ends when no coefficient moves further, shares of the shorter pitch.
+const SETTLED: f64 = 1e-4;
 
 /// `pixel = sum of coefficient * basis(column, row)`: affine in both, and bent along the row where there are enough
 /// columns to tell (perspective, terrain).
@@ -55,63 +60,49 @@ impl LatticeMap {
         if rows >= 4.0 && count >= 16.0 {
             powers.push((0, 2));
         }
-        let mut weights = vec![1.0; samples.len()];
         let reach = Vector2::new(cols, rows) / 2.0;
         let mut map = Self { center, scale, reach, terms: Vec::new() };
         let pitch = side_u.norm().min(side_v.norm()).max(1e-9);
+        let bases: Vec<[f64; MOST_TERMS]> = samples.iter().map(|s| map.bases(s.col, s.row, &powers)).collect();
+        let mut weights = vec![1.0; samples.len()];
+        let mut residuals = vec![0.0; samples.len()];
+        let mut sorted = Vec::with_capacity(samples.len());
         for round in 0..6 {
-            map.terms = map.solve(samples, &weights, &powers);
-            map.complete(cols, rows, side_u, side_v);
-            let mut residuals: Vec<f64> = samples.iter().map(|s| (map.pixel(s.col, s.row) - s.pixel).norm()).collect();
-            let exact = residuals.clone();
-            residuals.sort_by(f64::total_cmp);
-            let median = residuals[residuals.len() / 2];
-            let cut = (4.0 * 1.4826 * median).max(0.02 * pitch).max(0.2);
-            if round == 5 {
+            let before = std::mem::replace(&mut map.terms, solve(samples, &bases, &weights, &powers));
+            let moved = before.iter().zip(&map.terms).map(|(old, new)| (old.2 - new.2).amax()).fold(0.0, f64::max);
+            if round == 5 || (round > 0 && moved < SETTLED * pitch) {
                 break;
             }
-            for (weight, residual) in weights.iter_mut().zip(exact) {
+            for ((rest, sample), basis) in residuals.iter_mut().zip(samples).zip(&bases) {
+                let fitted = map.terms.iter().zip(basis).map(|(term, basis)| term.2 * *basis).sum::<Vector2<f64>>();
+                *rest = (fitted - sample.pixel).norm();
+            }
+            sorted.clone_from(&residuals);
+            let median = *sorted.select_nth_unstable_by(samples.len() / 2, f64::total_cmp).1;
+            let cut = (4.0 * 1.4826 * median).max(0.02 * pitch).max(0.2);
+            for (weight, residual) in weights.iter_mut().zip(&residuals) {
                 let t = residual / cut;
                 // Outliers keep a trace of weight, so that the system stays solvable.
                 *weight = if t < 1.0 { (1.0 - t * t).powi(2) } else { 0.0 }.max(1e-6);
             }
         }
+        map.complete(cols, rows, side_u, side_v);
         map
     }
 
-    fn basis(&self, col: f64, row: f64, power: (u8, u8)) -> f64 {
-        let (c, r) = ((col - self.center.x) / self.scale, (row - self.center.y) / self.scale);
-        c.powi(i32::from(power.0)) * r.powi(i32::from(power.1))
+    /// Column and row in the map's own units.
+    fn scaled(&self, col: f64, row: f64) -> [f64; 2] {
+        [(col - self.center.x) / self.scale, (row - self.center.y) / self.scale]
     }
 
-    fn solve(&self, samples: &[Sample], weights: &[f64], powers: &[(u8, u8)]) -> Vec<(u8, u8, Vector2<f64>)> {
-        let n = powers.len();
-        let mut normal = DMatrix::<f64>::zeros(n, n);
-        let mut right = [DVector::<f64>::zeros(n), DVector::<f64>::zeros(n)];
-        let mut row = vec![0.0; n];
-        for (sample, weight) in samples.iter().zip(weights) {
-            for (value, power) in row.iter_mut().zip(powers) {
-                *value = self.basis(sample.col, sample.row, *power);
-            }
-            for i in 0..n {
-                for j in 0..=i {
-                    normal[(i, j)] += weight * row[i] * row[j];
-                }
-                right[0][i] += weight * row[i] * sample.pixel.x;
-                right[1][i] += weight * row[i] * sample.pixel.y;
-            }
+    /// The value of each term's powers.
+    fn bases(&self, col: f64, row: f64, powers: &[(u8, u8)]) -> [f64; MOST_TERMS] {
+        let [c, r] = self.scaled(col, row).map(powers_of);
+        let mut values = [0.0; MOST_TERMS];
+        for (value, (i, j)) in values.iter_mut().zip(powers) {
+            *value = c[usize::from(*i)] * r[usize::from(*j)];
         }
-        for i in 0..n {
-            normal[(i, i)] += 1e-9;
-            for j in 0..i {
-                normal[(j, i)] = normal[(i, j)];
-            }
-        }
-        let Some(cholesky) = normal.cholesky() else {
-            return vec![(0, 0, samples.iter().map(|s| s.pixel).sum::<Vector2<f64>>() / samples.len() as f64)];
-        };
-        let (x, y) = (cholesky.solve(&right[0]), cholesky.solve(&right[1]));
-        powers.iter().enumerate().map(|(k, power)| (power.0, power.1, Vector2::new(x[k], y[k]))).collect()
+        values
     }
 
     /// Adds the pitch along an axis that the samples do not show.
@@ -126,10 +117,7 @@ impl LatticeMap {
 
     /// The pixel of a lattice coordinate. Beyond the samples the map goes on straight: a bend must not run away.
     pub fn pixel(&self, col: f64, row: f64) -> Vector2<f64> {
-        let inside = |value: f64, axis: usize| {
-            value.clamp(self.center[axis] - self.reach[axis], self.center[axis] + self.reach[axis])
-        };
-        let (c, r) = (inside(col, 0), inside(row, 1));
+        let [c, r] = self.within(col, row);
         let mut pixel = self.polynomial(c, r);
         if c != col {
             pixel += (self.polynomial(c + 0.5, r) - self.polynomial(c - 0.5, r)) * (col - c);
@@ -141,7 +129,32 @@ impl LatticeMap {
     }
 
     fn polynomial(&self, col: f64, row: f64) -> Vector2<f64> {
-        self.terms.iter().map(|(i, j, coefficient)| *coefficient * self.basis(col, row, (*i, *j))).sum()
+        let [c, r] = self.scaled(col, row).map(powers_of);
+        self.terms.iter().map(|(i, j, coefficient)| *coefficient * (c[usize::from(*i)] * r[usize::from(*j)])).sum()
+    }
+
+    /// Derivatives of the polynomial by column and by row.
+    fn slopes(&self, col: f64, row: f64) -> [Vector2<f64>; 2] {
+        let [c, r] = self.scaled(col, row).map(powers_of);
+        let mut slopes = [Vector2::zeros(); 2];
+        for (i, j, coefficient) in &self.terms {
+            let (i, j) = (usize::from(*i), usize::from(*j));
+            if i > 0 {
+                slopes[0] += coefficient * (i as f64 * c[i - 1] * r[j] / self.scale);
+            }
+            if j > 0 {
+                slopes[1] += coefficient * (j as f64 * c[i] * r[j - 1] / self.scale);
+            }
+        }
+        slopes
+    }
+
+    /// The nearest lattice coordinate at which there were samples.
+    fn within(&self, col: f64, row: f64) -> [f64; 2] {
+        let inside = |value: f64, axis: usize| {
+            value.clamp(self.center[axis] - self.reach[axis], self.center[axis] + self.reach[axis])
+        };
+        [inside(col, 0), inside(row, 1)]
     }
 
     /// Pixels per column and per row at a lattice coordinate.
@@ -156,7 +169,8 @@ impl LatticeMap {
     pub fn coordinate(&self, pixel: Vector2<f64>) -> Option<Vector2<f64>> {
         let mut at = self.center;
         for _ in 0..25 {
-            let [du, dv] = self.pitch(at.x, at.y);
+            let [c, r] = self.within(at.x, at.y);
+            let [du, dv] = self.slopes(c, r);
             let determinant = du.perp(&dv);
             if determinant.abs() < 1e-9 {
                 return None;
@@ -170,6 +184,46 @@ impl LatticeMap {
         }
         None
     }
+}
+
+/// The powers of a number from nought to the third.
+fn powers_of(value: f64) -> [f64; 4] {
+    let square = value * value;
+    [1.0, value, square, square * value]
+}
+
+/// Weighted least squares.
+fn solve(
+    samples: &[Sample],
+    bases: &[[f64; MOST_TERMS]],
+    weights: &[f64],
+    powers: &[(u8, u8)],
+) -> Vec<(u8, u8, Vector2<f64>)> {
+    let mut normal = SMatrix::<f64, MOST_TERMS, MOST_TERMS>::zeros();
+    let mut right = SMatrix::<f64, MOST_TERMS, 2>::zeros();
+    let count = powers.len();
+    for ((sample, basis), weight) in samples.iter().zip(bases).zip(weights) {
+        for i in 0..count {
+            let weighted = weight * basis[i];
+            for j in 0..=i {
+                normal[(i, j)] += weighted * basis[j];
+            }
+            right[(i, 0)] += weighted * sample.pixel.x;
+            right[(i, 1)] += weighted * sample.pixel.y;
+        }
+    }
+    for i in 0..MOST_TERMS {
+        // Terms that are not in use stay nought.
+        normal[(i, i)] += if i < count { 1e-9 } else { 1.0 };
+        for j in 0..i {
+            normal[(j, i)] = normal[(i, j)];
+        }
+    }
+    let Some(cholesky) = normal.cholesky() else {
+        return vec![(0, 0, samples.iter().map(|s| s.pixel).sum::<Vector2<f64>>() / samples.len() as f64)];
+    };
+    let solution = cholesky.solve(&right);
+    powers.iter().enumerate().map(|(k, power)| (power.0, power.1, solution.row(k).transpose())).collect()
 }
 
 #[cfg(test)]
