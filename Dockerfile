@@ -21,6 +21,10 @@ COPY --from=web /heliomap/web/dist/ web/dist/
 RUN cargo build --release --locked --bin heliomap
 
 FROM debian:bookworm-slim
+# The authorities by which object stores, identity providers and receivers of webhooks are known.
+RUN apt-get update \
+    && apt-get install --yes --no-install-recommends ca-certificates \
+    && rm -rf /var/lib/apt/lists/*
 RUN useradd --system --uid 10001 --home-dir /data heliomap \
     && install --directory --owner=heliomap --group=heliomap /data
 COPY --from=build /heliomap/target/release/heliomap /usr/local/bin/heliomap
@@ -30,7 +34,7 @@ ENV ORT_DYLIB_PATH=/usr/local/lib/libonnxruntime.so \
     HELIOMAP_DATA_DIR=/data \
     HELIOMAP_LISTEN=0.0.0.0:8080 \
     HELIOMAP_LOG_FORMAT=json
-USER heliomap
+USER 10001
 VOLUME /data
 EXPOSE 8080
 ENTRYPOINT ["heliomap"]

@@ -17,7 +17,7 @@ export ORT_DYLIB_PATH ?= $(abspath $(ORT_LIBRARY))
 HELIOMAP_DATA ?= $(wildcard ../shared/data)
 export HELIOMAP_DATA
 
-.PHONY: help setup web demo test lint unit client kills tus contract query load scale-out structure bench scaling yolo-export openapi configuration clean
+.PHONY: help setup web demo test lint unit client kills tus contract query load scale-out deploy-lint fuzz structure bench scaling yolo-export openapi configuration clean
 
 help: ## List the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -101,6 +101,29 @@ load: setup ## 50 clients upload at once beside 200 dashboard requests per secon
 scale-out: setup .venv/s3/done ## Two workers on one core each against one, over Postgres and S3 in network namespaces; then one is cut off
 	$(CARGO) build --release --locked
 	$(PYTHON) tests/scale/scale_out.py
+
+deploy-lint: .venv/deploy/done ## Lint the Dockerfile, compose.yaml and the Helm chart
+	@.venv/deploy/bin/python deploy/lint.py
+
+.venv/deploy/done: deploy/requirements.txt
+	@$(PYTHON) -m venv .venv/deploy && .venv/deploy/bin/pip install --quiet --disable-pip-version-check --requirement $<
+	@touch $@
+
+# Nightly Rust and a workspace of its own: nothing else builds it. What is found is added to a copy of the corpora.
+CARGO_FUZZ_VERSION := 0.13.2
+FUZZ_SECONDS ?= 600
+FUZZ_TARGETS ?= ply reconstruction archive photo tus query
+FUZZ_BOUNDS := -timeout=10 -rss_limit_mb=1024 -max_len=65536
+
+fuzz: web .cargo-fuzz/bin/cargo-fuzz ## Fuzz every parser of what comes in, FUZZ_SECONDS each: no crash, no hang, bounded memory
+	@for target in $(FUZZ_TARGETS); do \
+	  mkdir -p target/fuzz-corpus/$$target; \
+	  PATH="$(CURDIR)/.cargo-fuzz/bin:$$PATH" $(CARGO) +nightly fuzz run $$target target/fuzz-corpus/$$target fuzz/corpus/$$target \
+	    -- -max_total_time=$(FUZZ_SECONDS) $(FUZZ_BOUNDS) -print_final_stats=1; \
+	done
+
+.cargo-fuzz/bin/cargo-fuzz:
+	@$(CARGO) install cargo-fuzz --version $(CARGO_FUZZ_VERSION) --locked --quiet --root .cargo-fuzz
 
 structure: setup ## Survey of many simulated plants of every kind, on all cores; fails where too few come out exactly
 	$(CARGO) test --release --locked --no-fail-fast --test structure -- --ignored --nocapture --test-threads 1

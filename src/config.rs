@@ -237,6 +237,36 @@ fn parse_quota(text: &str) -> Result<Quota, String> {
     }
 }
 
+/// `heliomap backup`.
+#[derive(Debug, Clone, Args)]
+pub struct BackupArgs {
+    /// Folder for the backup, new or empty; rows and blobs lie in it as in a data folder.
+    #[arg(value_name = "FOLDER")]
+    pub folder: PathBuf,
+    #[command(flatten)]
+    pub storage: StorageArgs,
+}
+
+/// `heliomap restore`.
+#[derive(Debug, Clone, Args)]
+pub struct RestoreArgs {
+    /// Folder of the backup.
+    #[arg(value_name = "FOLDER")]
+    pub folder: PathBuf,
+    #[command(flatten)]
+    pub storage: StorageArgs,
+}
+
+/// `heliomap verify`.
+#[derive(Debug, Clone, Args)]
+pub struct VerifyArgs {
+    /// Read every file and compare its digest, which takes its time.
+    #[arg(long)]
+    pub content: bool,
+    #[command(flatten)]
+    pub storage: StorageArgs,
+}
+
 /// `heliomap openapi`.
 #[derive(Debug, Clone, Args)]
 pub struct OpenapiArgs {

@@ -4,7 +4,8 @@ mod commands;
 
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 use heliomap::config::{
-    DoctorArgs, KeysArgs, LogArgs, OpenapiArgs, OrganisationsArgs, ServeArgs, TraceArgs, WorkerArgs, file,
+    BackupArgs, DoctorArgs, KeysArgs, LogArgs, OpenapiArgs, OrganisationsArgs, RestoreArgs, ServeArgs, TraceArgs,
+    VerifyArgs, WorkerArgs, file,
 };
 
 /// Maps photovoltaic plants from drone overview photos: every module georeferenced, with its place in the plant.
@@ -30,6 +31,12 @@ enum Command {
     Keys(KeysArgs),
     /// List organisations, and say what each may keep.
     Organisations(OrganisationsArgs),
+    /// Put aside what a service with an SQLite database remembers; it may be running.
+    Backup(BackupArgs),
+    /// Make a data folder of a backup.
+    Restore(RestoreArgs),
+    /// Check that every file that the database names is there.
+    Verify(VerifyArgs),
     /// Map the plant in a folder as OpenSfM leaves it; no server is needed.
     Map(commands::map::MapArgs),
     /// Find the modules in photos and write their boxes.
@@ -63,6 +70,9 @@ fn run(command: Command) -> anyhow::Result<()> {
         Command::Worker(args) => commands::worker::run(args),
         Command::Keys(args) => commands::keys::run(args),
         Command::Organisations(args) => commands::organisations::run(args),
+        Command::Backup(args) => commands::backup::backup(args),
+        Command::Restore(args) => commands::backup::restore(args),
+        Command::Verify(args) => commands::backup::verify(args),
         Command::Map(args) => commands::map::run(&args),
         Command::Detect(args) => commands::detect::run(&args),
         Command::EvaluateDetection(args) => commands::evaluate_detection::run(&args),

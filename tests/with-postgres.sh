@@ -34,4 +34,5 @@ echo "host all all $address/24 trust" >>"$folder/data/pg_hba.conf"
     --options="-c listen_addresses=$address -c port=$port -c unix_socket_directories=$folder -c max_connections=300" start >/dev/null
 cd "$cd_back"
 export HELIOMAP_TEST_POSTGRES="postgres://heliomap@$address:$port"
+export HELIOMAP_TEST_POSTGRES_BIN=$bin
 "$@"

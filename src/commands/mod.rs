@@ -1,5 +1,6 @@
 //! One file per command. Here alone, concrete backends are named.
 
+pub mod backup;
 pub mod configuration;
 pub mod detect;
 pub mod doctor;

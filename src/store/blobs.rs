@@ -242,8 +242,13 @@ impl Blobs {
                 return Ok(());
             }
         }
+        self.copy(plant, sha256, target).await
+    }
+
+    /// Copies a blob to the new file `target` and checks it on the way.
+    pub async fn copy(&self, plant: PlantId, sha256: Digest, target: &Path) -> Result<(), StoreError> {
         let mut file = tokio::fs::File::create(target).await.map_err(io("create", target))?;
-        let mut chunks = self.store.get(&key).await?.into_stream();
+        let mut chunks = self.store.get(&key(plant, sha256)).await?.into_stream();
         let mut hasher = sha2::Sha256::new();
         while let Some(chunk) = chunks.try_next().await? {
             hasher.update(&chunk);
@@ -251,6 +256,35 @@ impl Blobs {
         }
         file.flush().await.map_err(io("write", target))?;
         if Digest(hasher.finalize().into()) == sha256 { Ok(()) } else { Err(StoreError::Damaged { plant, sha256 }) }
+    }
+
+    /// What is wrong with a blob of so many bytes, which is read and compared with its digest where `content` is asked
+    /// for.
+    pub async fn check(
+        &self,
+        plant: PlantId,
+        sha256: Digest,
+        size: u64,
+        content: bool,
+    ) -> Result<Option<String>, StoreError> {
+        let key = key(plant, sha256);
+        match self.store.head(&key).await {
+            Ok(there) if there.size != size => return Ok(Some(format!("it has {} bytes, not {size}", there.size))),
+            Ok(_) => {}
+            Err(object_store::Error::NotFound { .. }) => return Ok(Some("it is missing".to_owned())),
+            Err(error) => return Err(error.into()),
+        }
+        if content {
+            let mut chunks = self.store.get(&key).await?.into_stream();
+            let mut hasher = sha2::Sha256::new();
+            while let Some(chunk) = chunks.try_next().await? {
+                hasher.update(&chunk);
+            }
+            if Digest(hasher.finalize().into()) != sha256 {
+                return Ok(Some("it holds other bytes".to_owned()));
+            }
+        }
+        Ok(None)
     }
 
     /// Deletes everything of a plant.

@@ -25,9 +25,9 @@ pub use blobs::{Blobs, Digest, StagedFile};
 pub use bucket::Bucket;
 pub use postgres::PostgresStore;
 pub use records::{
-    Cancelled, Checkpoint, Claim, Completed, Created, Ending, Enqueued, Feature, FeatureQuery, FileRecord, FileWritten,
-    GeoBox, Heartbeat, Job, JobId, JobRequest, JobState, LayerInfo, Model, NewFeature, NewLayer, NewModel, Page, Plant,
-    Pool, Progress, Queue, Survey, SurveyId,
+    BlobRecord, Cancelled, Checkpoint, Claim, Completed, Created, Ending, Enqueued, Feature, FeatureQuery, FileRecord,
+    FileWritten, GeoBox, Heartbeat, Job, JobId, JobRequest, JobState, LayerInfo, Model, NewFeature, NewLayer, NewModel,
+    Page, Plant, Pool, Progress, Queue, Survey, SurveyId,
 };
 pub use requests::RequestStore;
 pub use secret::Secret;
@@ -136,6 +136,8 @@ pub trait Store: AccessStore + UploadStore + RequestStore + TaskStore + WebhookS
     /// A survey's files, sorted by path.
     async fn files(&self, survey: SurveyId) -> Result<Vec<FileRecord>, StoreError>;
 
+    /// The blobs that files and models name, each plant's once, by plant and digest: at most `limit` of those after one.
+    async fn blobs(&self, after: Option<(PlantId, Digest)>, limit: u32) -> Result<Vec<BlobRecord>, StoreError>;
     /// One file of a survey.
     async fn file(&self, survey: SurveyId, path: &SurveyPath) -> Result<Option<FileRecord>, StoreError>;
     /// A survey's photos sorted by path: at most `limit` of those after a text.

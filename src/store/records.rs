@@ -87,6 +87,15 @@ pub struct FileRecord {
     pub stored: Timestamp,
 }
 
+/// A blob that rows name.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct BlobRecord {
+    pub plant: PlantId,
+    pub sha256: Digest,
+    /// Bytes.
+    pub size: u64,
+}
+
 /// What became of a file that was put.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FileWritten {

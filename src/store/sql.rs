@@ -153,6 +153,12 @@ pub const PUT_FILE: &str = "\
 pub const COMPLETE_FILE: &str = "\
     UPDATE files SET photo = $3, shots = $4 WHERE survey_id = $1 AND path = $2 AND photo IS NULL AND shots IS NULL";
 pub const FILES: &str = concat!("SELECT ", file!(), " FROM files WHERE survey_id = $1 ORDER BY path");
+/// All blobs that rows name, by plant and digest, after `$1` and `$2`.
+pub const BLOBS: &str = "\
+    SELECT plant_id, sha256, size FROM (\
+        SELECT surveys.plant_id, files.sha256, files.size FROM files JOIN surveys ON surveys.id = files.survey_id \
+        UNION SELECT plant_id, sha256, size FROM models\
+    ) AS blobs WHERE (plant_id, sha256) > ($1, $2) ORDER BY plant_id, sha256 LIMIT $3";
 pub const FILE: &str = concat!("SELECT ", file!(), " FROM files WHERE survey_id = $1 AND path = $2");
 pub const PHOTOS: &str = concat!(
     "SELECT ",

@@ -59,6 +59,19 @@ impl SqliteStore {
         backend::examine::examine(&rows, &sqlx::migrate!("migrations/sqlite")).await
     }
 
+    /// Writes all rows as they are at one moment to a new file, while others read and write.
+    pub async fn snapshot(&self, target: &Path) -> Result<(), StoreError> {
+        let name = target.to_str().ok_or_else(|| io("name", target)(std::io::ErrorKind::InvalidFilename.into()))?;
+        sqlx::query("VACUUM INTO $1").bind(name).execute(&self.read).await?;
+        Ok(())
+    }
+
+    /// Ends all connections, after which the file is whole without the logs beside it.
+    pub async fn close(&self) {
+        self.read.close().await;
+        self.write.close().await;
+    }
+
     /// Name, open and idle connections of each pool.
     fn sizes(&self) -> Vec<(&'static str, u32, usize)> {
         let size = |name, pool: &SqlitePool| (name, pool.size(), pool.num_idle());

@@ -1,5 +1,9 @@
 //! The real program.
 
+mod backup;
+#[path = "../common/boxes.rs"]
+mod boxes;
+
 mod configuration;
 mod doctor;
 mod traces;
@@ -46,13 +50,14 @@ impl Program {
 
 /// Starts the program; its first line of output.
 fn start(data: &Path, arguments: &[&str]) -> (Program, String) {
-    let mut child = Command::new(env!("CARGO_BIN_EXE_heliomap"))
-        .args(arguments)
-        .env("HELIOMAP_DATA_DIR", data)
-        .stdout(Stdio::piped())
-        .stderr(Stdio::null())
-        .spawn()
-        .unwrap();
+    let mut command = Command::new(env!("CARGO_BIN_EXE_heliomap"));
+    command.args(arguments).env("HELIOMAP_DATA_DIR", data);
+    spawn(command)
+}
+
+/// Starts a program; its first line of output.
+fn spawn(mut command: Command) -> (Program, String) {
+    let mut child = command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
     let mut line = String::new();
     BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
     (Program(child), line)

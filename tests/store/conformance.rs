@@ -794,6 +794,37 @@ pub async fn quotas(store: &dyn Store) {
     assert_eq!(names, [(other.id, 0), (ORGANISATION, 50)]);
 }
 
+pub async fn blobs_that_rows_name(store: &dyn Store) {
+    let (a, b) = (plant(store, "A").await.id, plant(store, "B").await.id);
+    let (june, july) = (survey(store, a, "June").await, survey(store, a, "July").await);
+    let other = survey(store, b, "June").await;
+    store.put_files(june.id, &[file("images/a.jpg", "1"), file("images/b.jpg", "22")]).await.unwrap();
+    store.put_files(july.id, &[file("images/c.jpg", "1")]).await.unwrap();
+    store.put_files(other.id, &[file("images/a.jpg", "1")]).await.unwrap();
+    enqueue(store, &june).await;
+    let running = claim(store, 0).await.unwrap();
+    store.complete_job(&running, &model(a, 1, 1), at(1)).await.unwrap();
+    let mut found = Vec::new();
+    let mut after = None;
+    loop {
+        let page = store.blobs(after, 2).await.unwrap();
+        let Some(last) = page.last() else { break };
+        after = Some((last.plant, last.sha256));
+        found.extend(page.into_iter().map(|blob| (blob.plant, blob.sha256, blob.size)));
+    }
+    let mut expected = vec![
+        (a, Digest::of(b"1"), 1),
+        (a, Digest::of(b"22"), 2),
+        (a, Digest::of(b"model"), 5),
+        (b, Digest::of(b"1"), 1),
+    ];
+    expected.sort();
+    assert_eq!(found, expected);
+    // What is replaced is named no more.
+    store.put_files(june.id, &[file("images/b.jpg", "1")]).await.unwrap();
+    assert_eq!(store.blobs(None, 9).await.unwrap().len(), 3);
+}
+
 fn tasks(images: &[&str]) -> Vec<ImageTask> {
     let task = |image: &&str| ImageTask { image: (*image).to_owned(), document: format!("about {image}") };
     images.iter().map(task).collect()

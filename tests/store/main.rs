@@ -68,6 +68,7 @@ on_both!(
     quotas,
     webhooks,
     messages_are_sent_by_one_at_a_time_and_not_for_ever,
+    blobs_that_rows_name,
     images_of_a_job_are_shared,
     images_in_silent_hands_come_back,
     images_go_with_their_job,

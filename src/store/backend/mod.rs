@@ -12,10 +12,10 @@ mod webhooks;
 
 use super::super::sql;
 use super::super::{
-    Cancelled, Checkpoint, Claim, Completed, Created, Digest, Ending, Enqueued, Feature, FeatureQuery, FileRecord,
-    FileWritten, GeoBox, Heartbeat, Job, JobId, JobRequest, JobState, LayerInfo, Model, NewFeature, NewModel,
-    OrganisationId, Page, Plant, Pool, Progress, Queue, Quotas, Store, StoreError, Survey, SurveyId, SurveyPath,
-    TaskStore,
+    BlobRecord, Cancelled, Checkpoint, Claim, Completed, Created, Digest, Ending, Enqueued, Feature, FeatureQuery,
+    FileRecord, FileWritten, GeoBox, Heartbeat, Job, JobId, JobRequest, JobState, LayerInfo, Model, NewFeature,
+    NewModel, OrganisationId, Page, Plant, Pool, Progress, Queue, Quotas, Store, StoreError, Survey, SurveyId,
+    SurveyPath, TaskStore,
 };
 use super::{Row, Rows, Tx};
 use crate::plant::{Layer, ModuleId, PlantId};
@@ -194,6 +194,16 @@ impl Store for Rows {
     async fn files(&self, survey: SurveyId) -> Result<Vec<FileRecord>, StoreError> {
         let rows = sqlx::query(sql::FILES).bind(survey.to_string()).fetch_all(&self.read).await?;
         rows.iter().map(file).collect()
+    }
+
+    async fn blobs(&self, after: Option<(PlantId, Digest)>, limit: u32) -> Result<Vec<BlobRecord>, StoreError> {
+        let (plant, digest) = match after {
+            Some((plant, digest)) => (plant.to_string(), digest.to_string()),
+            None => (String::new(), String::new()),
+        };
+        let rows =
+            sqlx::query(sql::BLOBS).bind(plant).bind(digest).bind(i64::from(limit)).fetch_all(&self.read).await?;
+        rows.iter().map(read::blob).collect()
     }
 
     async fn file(&self, survey: SurveyId, path: &SurveyPath) -> Result<Option<FileRecord>, StoreError> {

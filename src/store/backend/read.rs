@@ -4,7 +4,7 @@ use super::super::Row;
 use crate::plant::{PlantId, Warning};
 use crate::store::requests::KeptAnswer;
 use crate::store::{
-    ApiKey, AuditEntry, Delivery, DeliveryId, Digest, FileRecord, Job, JobId, KeyId, Model, Organisation,
+    ApiKey, AuditEntry, BlobRecord, Delivery, DeliveryId, Digest, FileRecord, Job, JobId, KeyId, Model, Organisation,
     OrganisationId, Plant, Progress, Quotas, StoreError, Survey, SurveyId, SurveyPath, Upload, UploadId, Usage,
     Webhook, WebhookId,
 };
@@ -94,6 +94,11 @@ pub fn path(row: &Row) -> Result<SurveyPath, StoreError> {
 
 pub fn digest_and_path(row: &Row) -> Result<(Digest, SurveyPath), StoreError> {
     Ok((parsed(row, "sha256")?, path(row)?))
+}
+
+pub fn blob(row: &Row) -> Result<BlobRecord, StoreError> {
+    let size: i64 = row.try_get("size")?;
+    Ok(BlobRecord { plant: PlantId(uuid(row, "plant_id")?), sha256: parsed(row, "sha256")?, size: size as u64 })
 }
 
 pub fn file(row: &Row) -> Result<FileRecord, StoreError> {

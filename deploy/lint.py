@@ -1,0 +1,134 @@
+#!/usr/bin/env python3
+"""Checks the deployment files: the Dockerfile by hadolint, compose.yaml against the Compose specification, the Helm chart by
+Helm's own lint and, rendered with several sets of values, against Kubernetes' schemas. What is not Kubernetes' own, such as
+KEDA's ScaledObject, is checked for its kind alone. Nothing is run: that takes a container engine and a cluster.
+"""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import helm_python as helm
+import kubernetes_validate
+import yaml
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parent
+CHART = HERE / "helm" / "heliomap"
+BIN = Path(sys.executable).parent
+KUBERNETES = ("1.30", "1.37")
+#: Sets of values that between them take every branch of the templates.
+VALUES = {
+    "as it is": {},
+    "everything on": {
+        "autoscaling": {"enabled": True},
+        "blobs": {"endpoint": "https://store.example.org", "url": "s3://plants"},
+        "env": {"HELIOMAP_LOG": "debug"},
+        "image": {"tag": "1.2.3"},
+        "imagePullSecrets": [{"name": "registry"}],
+        "ingress": {"enabled": True, "className": "nginx", "tlsSecret": "tls", "annotations": {"a": "b"}},
+        "server": {"replicas": 3, "storage": {"className": "fast"}, "nodeSelector": {"disk": "ssd"}, "env": {"A": "1"},
+                   "tolerations": [{"operator": "Exists"}], "affinity": {"podAntiAffinity": {}}},
+        "serviceAccount": {"annotations": {"role": "r"}},
+        "worker": {"nodeSelector": {"gpu": "no"}, "tolerations": [{"operator": "Exists"}], "affinity": {"nodeAffinity": {}}},
+    },
+    "roles in place of keys": {"blobs": {"existingSecret": ""}, "metrics": {"scrapeAnnotations": False}},
+}
+#: Values that the chart's schema refuses.
+REFUSED = ({"blobs": {"url": "https://bucket"}}, {"database": {"existingSecret": ""}}, {"server": {"replicas": 0}}, {"typo": 1})
+
+
+def merged(base: dict, more: dict) -> dict:
+    both = dict(base)
+    for key, value in more.items():
+        both[key] = merged(both[key], value) if isinstance(value, dict) and isinstance(both.get(key), dict) else value
+    return both
+
+
+def run(*command: str) -> list[str]:
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    return [] if done.returncode == 0 else [f"{Path(command[0]).name}: {done.stdout}{done.stderr}"]
+
+
+def secure(name: str, pod: dict) -> list[str]:
+    """What a pod lacks of what this project promises."""
+    wrongs = []
+    if not pod["securityContext"].get("runAsNonRoot"):
+        wrongs.append(f"{name} may run as root")
+    for container in pod["containers"]:
+        security = container["securityContext"]
+        if security["allowPrivilegeEscalation"] or not security["readOnlyRootFilesystem"] or security["capabilities"]["drop"] != ["ALL"]:
+            wrongs.append(f"{name} may do more than it needs to")
+        if not container["resources"].get("limits", {}).get("memory"):
+            wrongs.append(f"{name} has no limit of memory")
+        if "livenessProbe" not in container:
+            wrongs.append(f"{name} has no probe")
+        for variable in container["env"]:
+            if re.search("DATABASE|KEY|SECRET|PASSWORD", variable["name"]) and "valueFrom" not in variable:
+                wrongs.append(f"{name} has {variable['name']} in the clear")
+    return wrongs
+
+
+def check_chart() -> list[str]:
+    wrongs = []
+    defaults = yaml.safe_load((CHART / "values.yaml").read_text())
+    result = helm.lint(CHART)
+    messages = result.get("messages") or []
+    wrongs += [f"helm lint: {message}" for message in messages if str(message.get("severity", "")).upper() in ("WARNING", "ERROR")]
+    wrongs += [f"helm lint: {error}" for error in result.get("errors") or []]
+    kinds = set()
+    with helm.Chart.load(CHART) as chart:
+        for title, values in VALUES.items():
+            values = merged(defaults, values)
+            chart.validate_schema(values)
+            rendered = chart.render(values=values, name="demo", namespace="heliomap")
+            files = rendered.get("manifests", rendered) if isinstance(rendered, dict) else {"all": rendered}
+            texts = files.values() if isinstance(files, dict) else files
+            for text in texts:
+                text = text if isinstance(text, str) else text.get("content", "")
+                for document in yaml.safe_load_all(text) if "apiVersion" in text else ():
+                    if not isinstance(document, dict):
+                        continue
+                    kind, name = document["kind"], document["metadata"]["name"]
+                    kinds.add(kind)
+                    if document["apiVersion"].startswith("keda.sh/"):
+                        continue
+                    for version in KUBERNETES:
+                        try:
+                            kubernetes_validate.validate(document, version, strict=True)
+                        except kubernetes_validate.ValidationError as error:
+                            wrongs.append(f"{title}, {kind} {name}, Kubernetes {version}: {error}")
+                    if kind in ("Deployment", "StatefulSet"):
+                        wrongs += secure(f"{title}, {kind} {name}:", document["spec"]["template"]["spec"])
+        for values in REFUSED:
+            try:
+                chart.validate_schema(merged(defaults, values))
+            except helm.HelmError:
+                continue
+            wrongs.append(f"the chart takes {values}")
+    expected = {"StatefulSet", "Deployment", "Service", "ServiceAccount", "Ingress", "ScaledObject", "PodDisruptionBudget"}
+    wrongs += [f"no {kind} was rendered" for kind in sorted(expected - kinds)]
+    return wrongs
+
+
+def check_steps() -> list[str]:
+    """The Dockerfile takes its steps from make, and names the Rust and the models that are used everywhere else."""
+    text = (ROOT / "Dockerfile").read_text()
+    return [f"the Dockerfile does not {step}" for step in
+            ("RUN make web", "RUN make .ort/libonnxruntime.so", "RUN cargo build --release --locked --bin heliomap") if step not in text]
+
+
+def main() -> int:
+    wrongs = run(str(BIN / "hadolint"), "--config", str(HERE / "hadolint.yaml"), "Dockerfile")
+    wrongs += run(str(BIN / "check-jsonschema"), "--builtin-schema", "vendor.compose-spec", "compose.yaml")
+    wrongs += check_steps() + check_chart()
+    for wrong in wrongs:
+        print(f"WRONG: {wrong}")
+    print(f"Dockerfile, compose.yaml and the Helm chart ({len(VALUES)} sets of values, Helm {helm.helm_sdk_version()}): "
+          f"{len(wrongs)} wrong")
+    return 1 if wrongs else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,206 @@
+//! `heliomap backup`, `restore` and `verify`: what the service remembers, put aside and taken back, every blob checked.
+
+use super::{open_blobs, open_storage, run_async};
+use anyhow::{Context, bail, ensure};
+use futures::{StreamExt, TryStreamExt, stream};
+use heliomap::config::{BackupArgs, RestoreArgs, StorageArgs, VerifyArgs};
+use heliomap::store::{BlobRecord, Blobs, Digest, SqliteStore, StagedFile, Store, UploadStore};
+use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
+use std::io::{ErrorKind, Write};
+use std::path::{Path, PathBuf};
+
+/// The rows, in a backup as in a data folder.
+const ROWS: &str = "heliomap.db";
+/// Written last: a backup without it is not whole.
+const MANIFEST: &str = "backup.json";
+/// Blobs that are looked up at once.
+const LOOKS_AT_ONCE: usize = 16;
+/// Blobs whose records are read at once.
+const PAGE: u32 = 1000;
+/// Blobs with which something is wrong that are named.
+const NAMED: usize = 10;
+
+/// What a backup holds.
+#[derive(Debug, Serialize, Deserialize)]
+struct Manifest {
+    /// The program that made it.
+    version: String,
+    created: Timestamp,
+    blobs: u64,
+    /// Of the blobs.
+    bytes: u64,
+}
+
+/// Makes a backup of a service that may be running.
+pub fn backup(args: BackupArgs) -> anyhow::Result<()> {
+    run_async(async {
+        only_sqlite(&args.storage, "make a backup of a Postgres database with pg_dump")?;
+        let folder = new_folder(&args.folder)?;
+        let rows = args.storage.data_dir.join(ROWS);
+        ensure!(rows.is_file(), "there is no {}: name the service's data folder with --data-dir", rows.display());
+        let (live, blobs) = (SqliteStore::open(&rows).await?, open_blobs(&args.storage).await?);
+        let target = folder.join(ROWS);
+        live.snapshot(&target).await.context("copying the database")?;
+        // Bytes of uploads that are not whole stay behind: clients begin these anew.
+        let snapshot = SqliteStore::open(&target).await?;
+        snapshot.delete_expired_uploads(Timestamp::MAX).await?;
+        let (mut count, mut bytes) = (0, 0);
+        let mut after = None;
+        loop {
+            let page = snapshot.blobs(after, PAGE).await?;
+            let Some(last) = page.last() else { break };
+            after = Some((last.plant, last.sha256));
+            for blob in page {
+                let place = folder.join(place(&blob));
+                let parent = place.parent().context("a blob lies in a folder")?;
+                std::fs::create_dir_all(parent).with_context(|| format!("creating {}", parent.display()))?;
+                match blobs.copy(blob.plant, blob.sha256, &place).await {
+                    Ok(()) => {
+                        sync(&place)?;
+                        count += 1;
+                        bytes += blob.size;
+                    }
+                    // Its plant was deleted meanwhile: that holds here, too.
+                    Err(_) if live.plant(blob.plant).await?.is_none() => {
+                        snapshot.delete_plant(blob.plant, Timestamp::now()).await?;
+                    }
+                    Err(error) => {
+                        return Err(error).context("a blob cannot be copied; `heliomap verify` lists all such");
+                    }
+                }
+            }
+        }
+        snapshot.close().await;
+        let _ = std::fs::remove_file(target.with_extension("lock"));
+        let manifest =
+            Manifest { version: env!("CARGO_PKG_VERSION").to_owned(), created: Timestamp::now(), blobs: count, bytes };
+        write_synced(&folder.join(MANIFEST), &serde_json::to_vec_pretty(&manifest)?)?;
+        println!("{count} blobs of {bytes} bytes and their rows are in {}", folder.display());
+        Ok(())
+    })
+}
+
+/// Makes a data folder of a backup; a folder that has rows is left alone, and rows come only after all their blobs.
+pub fn restore(args: RestoreArgs) -> anyhow::Result<()> {
+    run_async(async {
+        only_sqlite(&args.storage, "bring a Postgres database back with pg_restore")?;
+        let manifest = args.folder.join(MANIFEST);
+        let manifest = match std::fs::read(&manifest) {
+            Ok(text) => serde_json::from_slice::<Manifest>(&text)
+                .with_context(|| format!("{} is not what `heliomap backup` writes", manifest.display()))?,
+            Err(error) if error.kind() == ErrorKind::NotFound => {
+                bail!("{} is no whole backup: it has no {MANIFEST}", args.folder.display())
+            }
+            Err(error) => return Err(error).with_context(|| format!("reading {}", manifest.display())),
+        };
+        let data = &args.storage.data_dir;
+        let rows = data.join(ROWS);
+        ensure!(!rows.exists(), "{} has a database already: name a new folder with --data-dir", data.display());
+        std::fs::create_dir_all(data).with_context(|| format!("creating {}", data.display()))?;
+        let blobs = open_blobs(&args.storage).await?;
+        let coming = data.join("heliomap.restoring");
+        std::fs::copy(args.folder.join(ROWS), &coming).with_context(|| format!("copying {ROWS}"))?;
+        let store = SqliteStore::open(&coming).await.context("the backup's database cannot be read")?;
+        let taken = take_blobs(&store, &blobs, &args.folder).await;
+        store.close().await;
+        let _ = std::fs::remove_file(coming.with_extension("lock"));
+        let count = match taken {
+            Ok(count) => count,
+            Err(error) => {
+                let _ = std::fs::remove_file(&coming);
+                return Err(error);
+            }
+        };
+        ensure!(count == manifest.blobs, "the backup tells of {} blobs and holds {count}", manifest.blobs);
+        sync(&coming)?;
+        std::fs::rename(&coming, &rows).with_context(|| format!("renaming {}", coming.display()))?;
+        sync(data)?;
+        println!("{count} blobs and their rows are back, as of {}", manifest.created);
+        Ok(())
+    })
+}
+
+/// Stores all blobs that the rows name, from a backup; how many.
+async fn take_blobs(store: &dyn Store, blobs: &Blobs, backup: &Path) -> anyhow::Result<u64> {
+    let (mut count, mut after) = (0, None);
+    loop {
+        let page = store.blobs(after, PAGE).await?;
+        let Some(last) = page.last() else { return Ok(count) };
+        after = Some((last.plant, last.sha256));
+        for blob in page {
+            let source = backup.join(place(&blob));
+            let staged = tempfile::Builder::new().prefix("restore-").tempfile_in(blobs.staging())?.into_temp_path();
+            std::fs::copy(&source, &staged).with_context(|| format!("the backup lacks {}", source.display()))?;
+            let sha256 = Digest::of_file(&staged)?;
+            ensure!(sha256 == blob.sha256, "{} is damaged: it holds other bytes", source.display());
+            sync(&staged)?;
+            blobs.put_file(blob.plant, StagedFile { path: staged, size: blob.size, sha256 }).await?;
+            count += 1;
+        }
+    }
+}
+
+/// Checks that every blob that the rows name is there.
+pub fn verify(args: VerifyArgs) -> anyhow::Result<()> {
+    run_async(async {
+        let (store, blobs) = open_storage(&args.storage).await?;
+        let (mut count, mut wrong, mut after) = (0_u64, Vec::new(), None);
+        loop {
+            let page = store.blobs(after, PAGE).await?;
+            let Some(last) = page.last() else { break };
+            after = Some((last.plant, last.sha256));
+            count += page.len() as u64;
+            let (blobs, content) = (&blobs, args.content);
+            let looks = stream::iter(page).map(|blob| async move {
+                let fault = blobs.check(blob.plant, blob.sha256, blob.size, content).await?;
+                anyhow::Ok(fault.map(|fault| format!("plant {}, blob {}: {fault}", blob.plant, blob.sha256)))
+            });
+            let faults: Vec<_> = looks.buffered(LOOKS_AT_ONCE).try_collect().await?;
+            wrong.extend(faults.into_iter().flatten());
+        }
+        for fault in wrong.iter().take(NAMED) {
+            println!("{fault}");
+        }
+        ensure!(
+            wrong.is_empty(),
+            "{} of {count} blobs are not as they were stored: put them back from a backup",
+            wrong.len()
+        );
+        println!("all {count} blobs are there");
+        Ok(())
+    })
+}
+
+/// Where a blob lies in a backup, as in a data folder.
+fn place(blob: &BlobRecord) -> PathBuf {
+    let digest = blob.sha256.to_string();
+    PathBuf::from(format!("blobs/plants/{}/{}/{digest}", blob.plant, &digest[..2]))
+}
+
+fn only_sqlite(storage: &StorageArgs, what: &str) -> anyhow::Result<()> {
+    ensure!(
+        storage.database.is_none(),
+        "{what} and its blobs with the tools of their store; docs/OPERATION.md tells how"
+    );
+    Ok(())
+}
+
+/// A folder that is new, or empty.
+fn new_folder(folder: &Path) -> anyhow::Result<&Path> {
+    std::fs::create_dir_all(folder).with_context(|| format!("creating {}", folder.display()))?;
+    let empty = std::fs::read_dir(folder).with_context(|| format!("reading {}", folder.display()))?.next().is_none();
+    ensure!(empty, "{} is not empty: every backup has a folder of its own", folder.display());
+    Ok(folder)
+}
+
+fn write_synced(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    let mut file = std::fs::File::create(path).with_context(|| format!("creating {}", path.display()))?;
+    file.write_all(bytes).and_then(|()| file.sync_all()).with_context(|| format!("writing {}", path.display()))
+}
+
+/// Makes a file or folder durable.
+fn sync(path: &Path) -> anyhow::Result<()> {
+    let synced = std::fs::File::open(path).and_then(|file| file.sync_all());
+    synced.with_context(|| format!("syncing {}", path.display()))
+}
