@@ -2,6 +2,7 @@
 
 use super::{GRACE, open_blobs, run_async};
 use heliomap::config::{DoctorArgs, ServeArgs};
+use heliomap::oidc::Oidc;
 use heliomap::plant::PlantId;
 use heliomap::store::schema::{Examined, Schema};
 use heliomap::store::{PostgresStore, SqliteStore};
@@ -90,6 +91,7 @@ async fn examine(args: &ServeArgs) -> Vec<Check> {
         within("storage", storage(args)).await,
         within("detector", detector(args)).await,
         certificates(),
+        within("identity provider", identity_provider(args)).await,
     ]
 }
 
@@ -288,5 +290,23 @@ fn certificates() -> Check {
             format!("webhooks cannot be told: {}", chain(&error.into())),
             "install the certificates of public authorities, on Debian the package ca-certificates",
         ),
+    }
+}
+
+/// The keys of the identity provider, where there is one.
+async fn identity_provider(args: &ServeArgs) -> Check {
+    const NAME: &str = "identity provider";
+    const ADVICE: &str =
+        "see that --oidc-issuer is the provider's issuer to the letter, and that this machine may ask it";
+    let settings = match args.oidc.settings() {
+        Ok(None) => return Check::ok(NAME, "none is configured"),
+        Ok(Some(settings)) => settings,
+        Err(wrong) => return Check::failed(NAME, wrong, "the service does not start before both are given"),
+    };
+    let fetched = async { Oidc::new(settings)?.fetch().await };
+    match fetched.await {
+        Ok(0) => Check::failed(NAME, "it has no key that signs by RS256, ES256 or EdDSA", ADVICE),
+        Ok(count) => Check::ok(NAME, format!("it has {count} keys")),
+        Err(error) => Check::failed(NAME, error.to_string(), ADVICE),
     }
 }

@@ -4,7 +4,7 @@ use super::{open_storage, run_async};
 use anyhow::{Context, bail};
 use heliomap::config::{KeysArgs, KeysCommand};
 use heliomap::plant::PlantId;
-use heliomap::store::{ApiKey, Created, KeyId, NewKey, OrganisationId, Page, Secret, Store};
+use heliomap::store::{ApiKey, Created, KeyId, NewKey, OrganisationId, Page, Secret, Store, TimeSpan};
 use jiff::{SignedDuration, Timestamp};
 
 /// Runs the command.
@@ -38,7 +38,7 @@ pub fn run(args: KeysArgs) -> anyhow::Result<()> {
             KeysCommand::List => {
                 let mut after = None;
                 loop {
-                    let keys = store.keys(None, Page { after, limit: 500 }).await?;
+                    let keys = store.keys(None, TimeSpan::default(), Page { after, limit: 500 }).await?;
                     let Some(last) = keys.last() else { break };
                     after = Some(last.seq);
                     for key in &keys {
@@ -75,7 +75,7 @@ async fn organisation_named(store: &dyn Store, name: &str, now: Timestamp) -> an
 async fn key_of_any(store: &dyn Store, id: KeyId) -> anyhow::Result<ApiKey> {
     let mut after = None;
     loop {
-        let keys = store.keys(None, Page { after, limit: 500 }).await?;
+        let keys = store.keys(None, TimeSpan::default(), Page { after, limit: 500 }).await?;
         let Some(last) = keys.last() else { bail!("no key has the identifier {id}; `heliomap keys list` shows them") };
         after = Some(last.seq);
         if let Some(key) = keys.into_iter().find(|key| key.id == id) {

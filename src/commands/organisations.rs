@@ -17,6 +17,11 @@ pub fn run(args: OrganisationsArgs) -> anyhow::Result<()> {
                     println!("{}", line(&organisation, &usage));
                 }
             }
+            OrganisationsCommand::Create { name } => {
+                store.create_organisation(&name, Timestamp::now()).await?;
+                let (organisation, usage) = named(&*store, &name).await?;
+                println!("{}", line(&organisation, &usage));
+            }
             OrganisationsCommand::Quota { name, bytes, plants } => {
                 let (organisation, usage) = named(&*store, &name).await?;
                 let own = Quotas {

@@ -4,7 +4,8 @@ use super::{GRACE, open_storage, pipeline_worker, run_async, send_messages, serv
 use anyhow::Context;
 use heliomap::config::ServeArgs;
 use heliomap::http::{self, AppState};
-use heliomap::store::Page;
+use heliomap::oidc::Oidc;
+use heliomap::store::{Page, TimeSpan};
 use heliomap::telemetry::metrics::Scrape;
 use std::sync::Arc;
 use tokio::net::TcpListener;
@@ -19,6 +20,9 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
              --insecure out and make keys with `heliomap keys create`",
             args.listen
         );
+        let oidc = args.oidc.settings().map_err(anyhow::Error::msg)?.map(Oidc::new).transpose();
+        let oidc = oidc.context("cannot use the provider of --oidc-issuer")?;
+        let oidc = oidc.map(Arc::new);
         let (store, blobs) = open_storage(&args.storage).await?;
         let stop = stop_signal()?;
         let listener = TcpListener::bind(args.listen)
@@ -30,6 +34,7 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
             network: Arc::new(args.network),
             bell: Arc::new(Notify::new()),
             stop: stop.clone(),
+            oidc,
             targets: args.webhooks.targets(),
             insecure: args.insecure,
             ..AppState::new(store.clone(), blobs.clone(), args.limits.clone())
@@ -43,7 +48,7 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
 
         let (app, limits, closing) = (http::router(state), args.limits, stop.clone());
         let serving = tokio::spawn(async move { http::serve(listener, app, &limits, closing).await });
-        if !args.insecure && store.keys(None, Page { after: None, limit: 1 }).await?.is_empty() {
+        if !args.insecure && store.keys(None, TimeSpan::default(), Page { after: None, limit: 1 }).await?.is_empty() {
             tracing::warn!(
                 "there is no key yet, so nobody gets in: make the first with `heliomap keys create --scope admin --name NAME` \
                  on the same data folder"

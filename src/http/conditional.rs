@@ -1,6 +1,8 @@
-//! What a client has already is not sent again: `ETag` and `If-None-Match` (RFC 9110) on everything that is read.
+//! What a client has already is not sent again: `ETag` and `If-None-Match` (RFC 9110) on everything that is read. And nobody
+//! changes what someone else changed meanwhile, unless that is wanted: `If-Match` on what is replaced or deleted.
 
-use crate::store::Digest;
+use super::error::{ApiError, Code};
+use crate::store::{Digest, Wanted};
 use axum::body::{Body, HttpBody, to_bytes};
 use axum::extract::Request;
 use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
@@ -49,6 +51,57 @@ pub async fn conditional(request: Request, next: Next) -> Response {
     let headers: HeaderMap =
         kept.into_iter().filter_map(|name| Some((name.clone(), parts.headers.get(name)?.clone()))).collect();
     (StatusCode::NOT_MODIFIED, headers).into_response()
+}
+
+/// The tag of a file, by which it may be replaced.
+pub fn file_tag(sha256: Digest) -> String {
+    format!("\"{sha256}\"")
+}
+
+/// What a request wants to be at a file's place: a file with one of the tags of `If-Match`, or by `If-None-Match: *` none.
+pub fn wanted(headers: &HeaderMap) -> Result<Option<Wanted>, ApiError> {
+    let words = |name: header::HeaderName| -> Option<Vec<String>> {
+        let mut values = headers.get_all(name).iter().peekable();
+        values.peek()?;
+        let texts = values.filter_map(|value| value.to_str().ok());
+        Some(texts.flat_map(|text| text.split(',')).map(|word| word.trim().to_owned()).collect())
+    };
+    if let Some(tags) = words(header::IF_MATCH) {
+        if tags.iter().any(|tag| tag == "*") {
+            return Ok(Some(Wanted::Anything));
+        }
+        // What is no tag of a file is that of none.
+        let digests = tags.iter().filter_map(|tag| tag.trim_start_matches("W/").trim_matches('"').parse().ok());
+        return Ok(Some(Wanted::OneOf(digests.collect())));
+    }
+    match words(header::IF_NONE_MATCH) {
+        None => Ok(None),
+        Some(tags) if tags.iter().any(|tag| tag == "*") => Ok(Some(Wanted::Nothing)),
+        Some(_) => Err(ApiError::new(
+            Code::BadRequest,
+            "with an upload, if-none-match takes `*` alone: only where nothing is there",
+        )),
+    }
+}
+
+/// What is said where something is not as the request wants it.
+pub fn failed() -> ApiError {
+    ApiError::new(
+        Code::PreconditionFailed,
+        "someone changed it meanwhile, and nothing of this request was done: look at it as it is now, then decide anew",
+    )
+}
+
+/// Whether a request says which state of something it is about.
+pub fn is_asked(headers: &HeaderMap) -> bool {
+    headers.contains_key(header::IF_MATCH)
+}
+
+/// Refuses a request that is about another state of something than this, which `GET` would answer.
+pub fn require(headers: &HeaderMap, current: &impl serde::Serialize) -> Result<(), ApiError> {
+    let current = tag(&serde_json::to_vec(current).map_err(|error| ApiError::internal(&error))?);
+    let holds = headers.get_all(header::IF_MATCH).iter().any(|value| matches(value, &current));
+    if holds || !is_asked(headers) { Ok(()) } else { Err(failed()) }
 }
 
 /// Whether a list of tags holds one, by the weak comparison.

@@ -60,6 +60,7 @@ codes! {
     TooManyWebhooks = CONFLICT, "too_many_webhooks", "There are as many webhooks as there may be";
     IdempotencyBusy = CONFLICT, "idempotency_busy", "The request is being answered";
     UploadOffset = CONFLICT, "upload_offset", "The bytes do not go on where the upload is";
+    PreconditionFailed = PRECONDITION_FAILED, "precondition_failed", "What is there is not what the request speaks of";
     TusVersion = PRECONDITION_FAILED, "tus_version", "The protocol's version is missing or another";
     UploadBusy = LOCKED, "upload_busy", "The upload is in other hands";
     TooLarge = PAYLOAD_TOO_LARGE, "too_large", "The upload is too large";

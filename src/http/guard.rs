@@ -5,6 +5,7 @@ use super::AppState;
 use super::error::{ApiError, Code};
 use super::intake::receive::drain;
 use super::server::Peer;
+use crate::oidc::{Oidc, OidcError};
 use crate::plant::PlantId;
 use crate::store::{ApiKey, AuditEntry, Digest, KeyId, OrganisationId, Scope};
 use axum::extract::{FromRequestParts, MatchedPath, RawPathParams, Request, State};
@@ -19,6 +20,7 @@ use std::sync::Arc;
 use tower_http::request_id::RequestId;
 use utoipa::openapi::security::{HttpAuthScheme, HttpBuilder, SecurityScheme};
 use utoipa::openapi::{ContentBuilder, OpenApi, Ref, ResponseBuilder};
+use uuid::Uuid;
 
 /// The name of the one way in, in the API's description.
 const SCHEME: &str = "key";
@@ -30,8 +32,12 @@ const LAST_USE_GRAIN: SignedDuration = SignedDuration::from_mins(1);
 #[derive(Debug, Clone)]
 pub struct Caller {
     pub organisation: OrganisationId,
-    /// The key and its name; none where the service asks for no keys.
+    /// The key and its name; none where the caller shows another thing, or nothing has to be shown.
     pub key: Option<(KeyId, String)>,
+    /// Who it is by the identity provider's token.
+    pub subject: Option<String>,
+    /// Whose requests are counted together.
+    pub counted: Option<KeyId>,
     pub scopes: BTreeSet<Scope>,
     /// The plants that the caller may see; all of the organisation's where there is no list.
     pub plants: Option<Vec<PlantId>>,
@@ -41,7 +47,7 @@ impl Caller {
     /// Whoever sends requests where the service asks for no keys.
     fn anyone() -> Self {
         let (organisation, scopes) = (OrganisationId::DEFAULT, BTreeSet::from([Scope::Admin]));
-        Self { organisation, key: None, scopes, plants: None }
+        Self { organisation, key: None, subject: None, counted: None, scopes, plants: None }
     }
 
     /// Refuses a caller whose key is for some plants only.
@@ -61,7 +67,14 @@ impl Caller {
 
 impl From<ApiKey> for Caller {
     fn from(key: ApiKey) -> Self {
-        Self { organisation: key.organisation, key: Some((key.id, key.name)), scopes: key.scopes, plants: key.plants }
+        Self {
+            organisation: key.organisation,
+            key: Some((key.id, key.name)),
+            subject: None,
+            counted: Some(key.id),
+            scopes: key.scopes,
+            plants: key.plants,
+        }
     }
 }
 
@@ -126,8 +139,8 @@ pub fn describe(description: &mut OpenApi) {
     let scheme = HttpBuilder::new()
         .scheme(HttpAuthScheme::Bearer)
         .description(Some(
-            "A key of this service: `Authorization: Bearer hm_…`. Each operation names the scopes that open it, of which \
-             one is enough; `admin` opens all.",
+            "A key of this service, `Authorization: Bearer hm_…`, or a token of the identity provider that the service is \
+             configured for. Each operation names the scopes that open it, of which one is enough; `admin` opens all.",
         ))
         .build();
     components.add_security_scheme(SCHEME, SecurityScheme::Http(scheme));
@@ -141,6 +154,8 @@ pub fn describe(description: &mut OpenApi) {
         for operation in operations.into_iter().flatten() {
             if operation.security.as_ref().is_some_and(|needs| needs.iter().all(|need| *need != Default::default())) {
                 let responses = &mut operation.responses.responses;
+                let unchecked = "`unavailable`: no token can be checked now; or another reason, as the code tells";
+                responses.entry("503".to_owned()).or_insert_with(|| problem(unchecked).into());
                 responses.insert("401".to_owned(), problem("`unauthorized`: no key, or none that is good").into());
                 responses.insert("403".to_owned(), problem("`forbidden`: the key does not open this").into());
                 responses
@@ -183,6 +198,7 @@ pub async fn guard(
         organisation: caller.organisation,
         at: Timestamp::now(),
         key: caller.key.clone(),
+        subject: caller.subject.clone(),
         method: request.method().to_string(),
         path: request.uri().path().to_owned(),
         status: 0,
@@ -216,6 +232,9 @@ impl Gate {
         let secret =
             bearer.filter(|(scheme, _)| scheme.eq_ignore_ascii_case("bearer")).map(|(_, secret)| secret.trim());
         let now = Timestamp::now();
+        if let (Some(oidc), Some(token)) = (&self.state.oidc, secret.filter(|secret| secret.contains('.'))) {
+            return self.bearer(oidc, token).await;
+        }
         let found = match secret {
             Some(secret) => self.state.store.key_of_secret(Digest::of(secret.as_bytes()), now).await?,
             None => None,
@@ -227,6 +246,36 @@ impl Gate {
             tracing::warn!(%error, key = %key.id, "the key's last use cannot be noted");
         }
         Ok(key.into())
+    }
+
+    /// Who showed a token of the identity provider.
+    async fn bearer(&self, oidc: &Oidc, token: &str) -> Result<Caller, ApiError> {
+        let bearer = oidc.bearer(token).await.map_err(|error| match error {
+            OidcError::Refused(_) => {
+                ApiError::new(Code::Unauthorized, format!("{error}; ask the identity provider for a new one"))
+            }
+            OidcError::Unavailable(_) => ApiError::new(
+                Code::Unavailable,
+                "the identity provider's keys cannot be fetched, so that no token can be checked",
+            )
+            .retry_after(10),
+        })?;
+        let organisation = self.state.store.organisation(&bearer.organisation).await?.ok_or_else(|| {
+            let detail = format!(
+                "there is no organisation `{}`; whoever runs the service makes it with `heliomap organisations create`",
+                bearer.organisation
+            );
+            ApiError::new(Code::Forbidden, detail)
+        })?;
+        let name = format!("{}#{}", oidc.issuer(), bearer.subject);
+        Ok(Caller {
+            organisation: organisation.id,
+            key: None,
+            counted: Some(KeyId(Uuid::new_v5(&Uuid::NAMESPACE_URL, name.as_bytes()))),
+            subject: Some(bearer.subject),
+            scopes: bearer.scopes,
+            plants: None,
+        })
     }
 
     /// What is said to a caller without a good key; who fails too often is told to wait.
@@ -242,8 +291,8 @@ impl Gate {
 
     /// A caller that does not ask too often.
     fn within_rate(&self, caller: Caller) -> Result<Caller, ApiError> {
-        if let Some((key, _)) = &caller.key {
-            self.state.rates.request(*key)?;
+        if let Some(counted) = caller.counted {
+            self.state.rates.request(counted)?;
         }
         Ok(caller)
     }

@@ -3,7 +3,7 @@
 use super::AppState;
 use super::error::{ApiError, Code, Problem};
 use super::extract::{ApiPath, ApiQuery};
-use super::paging::{List, PageQuery};
+use super::paging::{List, filtered_list, state_filter};
 use super::surveys::missing_views;
 use crate::pipeline::{MapOptions, Stage};
 use crate::plant::{BenchId, PlantId, Warning};
@@ -208,6 +208,27 @@ impl From<Job> for JobView {
     }
 }
 
+const STATES: &str = "queued, running, succeeded, failed and cancelled";
+
+filtered_list!(
+    /// Which jobs of a survey.
+    JobsOfSurveyQuery {
+        /// Only those in this state: `queued`, `running`, `succeeded`, `failed` or `cancelled`.
+        #[param(pattern = "^(queued|running|succeeded|failed|cancelled)$")]
+        state: String,
+    }
+);
+filtered_list!(
+    /// Which jobs of a plant.
+    JobsQuery {
+        /// Only those in this state: `queued`, `running`, `succeeded`, `failed` or `cancelled`.
+        #[param(pattern = "^(queued|running|succeeded|failed|cancelled)$")]
+        state: String,
+        /// Only those of this survey.
+        survey: uuid::Uuid,
+    }
+);
+
 fn place(plant: PlantId, job: JobId) -> String {
     format!("/api/v1/plants/{plant}/jobs/{job}")
 }
@@ -287,7 +308,7 @@ pub async fn start(
     params(
         ("plant" = Uuid, Path, description = "The plant's identifier"),
         ("survey" = Uuid, Path, description = "The survey's identifier"),
-        PageQuery
+        JobsOfSurveyQuery
     ),
     responses(
         (status = 200, body = List<JobView>),
@@ -298,12 +319,14 @@ pub async fn start(
 pub async fn list_of_survey(
     State(state): State<AppState>,
     ApiPath((plant, survey)): ApiPath<(PlantId, SurveyId)>,
-    ApiQuery(query): ApiQuery<PageQuery>,
+    ApiQuery(query): ApiQuery<JobsOfSurveyQuery>,
 ) -> Result<List<JobView>, ApiError> {
-    let page = query.page()?;
+    let part = query.part();
+    let (page, wanted) = (part.page()?, state_filter(query.state.as_deref(), STATES)?);
     state.require_survey(plant, survey).await?;
-    let jobs = state.store.jobs(plant, Some(survey), page).await?;
-    query.items(&format!("/api/v1/plants/{plant}/surveys/{survey}/jobs"), jobs, |job| job.seq, JobView::from)
+    let jobs = state.store.jobs(plant, Some(survey), wanted, page).await?;
+    let path = query.path(&format!("/api/v1/plants/{plant}/surveys/{survey}/jobs"));
+    part.items(&path, jobs, |job| job.seq, JobView::from)
 }
 
 /// List a plant's jobs, the newest first
@@ -312,7 +335,7 @@ pub async fn list_of_survey(
     path = "/api/v1/plants/{plant}/jobs",
     tag = "jobs",
     security(("key" = ["read"]), ("key" = ["review"]), ("key" = ["upload"])),
-    params(("plant" = Uuid, Path, description = "The plant's identifier"), PageQuery),
+    params(("plant" = Uuid, Path, description = "The plant's identifier"), JobsQuery),
     responses(
         (status = 200, body = List<JobView>),
         (status = "4XX", description = "`plant_not_found`, `invalid_query`", body = Problem,
@@ -322,12 +345,14 @@ pub async fn list_of_survey(
 pub async fn list(
     State(state): State<AppState>,
     ApiPath(plant): ApiPath<PlantId>,
-    ApiQuery(query): ApiQuery<PageQuery>,
+    ApiQuery(query): ApiQuery<JobsQuery>,
 ) -> Result<List<JobView>, ApiError> {
-    let page = query.page()?;
+    let part = query.part();
+    let (page, wanted) = (part.page()?, state_filter(query.state.as_deref(), STATES)?);
     state.require_plant(plant).await?;
-    let jobs = state.store.jobs(plant, None, page).await?;
-    query.items(&format!("/api/v1/plants/{plant}/jobs"), jobs, |job| job.seq, JobView::from)
+    let jobs = state.store.jobs(plant, query.survey.map(SurveyId), wanted, page).await?;
+    let path = query.path(&format!("/api/v1/plants/{plant}/jobs"));
+    part.items(&path, jobs, |job| job.seq, JobView::from)
 }
 
 /// One job: poll it until its state is final

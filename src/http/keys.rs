@@ -4,10 +4,10 @@ use super::AppState;
 use super::error::{ApiError, Code, Problem};
 use super::extract::{ApiJson, ApiPath, ApiQuery};
 use super::guard::Caller;
-use super::paging::{List, PageQuery};
+use super::paging::{List, filtered_list};
 use super::plants::checked_name;
 use crate::plant::PlantId;
-use crate::store::{ApiKey, AuditEntry, KeyId, NewKey, Scope, Secret};
+use crate::store::{ApiKey, AuditEntry, KeyId, NewKey, Scope, Secret, TimeSpan};
 use axum::Json;
 use axum::extract::State;
 use axum::http::{StatusCode, header};
@@ -102,6 +102,29 @@ impl From<ApiKey> for KeyView {
     }
 }
 
+filtered_list!(
+    /// Which keys.
+    KeysQuery {
+        /// Only those made at this time or after it.
+        #[param(value_type = Option<String>, format = DateTime)]
+        since: Timestamp,
+        /// Only those made before this time.
+        #[param(value_type = Option<String>, format = DateTime)]
+        until: Timestamp,
+    }
+);
+filtered_list!(
+    /// Which entries of the log.
+    AuditQuery {
+        /// Only those of this time or after it.
+        #[param(value_type = Option<String>, format = DateTime)]
+        since: Timestamp,
+        /// Only those before this time.
+        #[param(value_type = Option<String>, format = DateTime)]
+        until: Timestamp,
+    }
+);
+
 fn no_key(id: KeyId) -> ApiError {
     ApiError::new(Code::KeyNotFound, format!("no key has the identifier {id}; GET /api/v1/keys lists them"))
 }
@@ -167,7 +190,7 @@ pub async fn create(
     path = "/api/v1/keys",
     tag = "access",
     security(("key" = ["admin"])),
-    params(PageQuery),
+    params(KeysQuery),
     responses(
         (status = 200, body = List<KeyView>),
         (status = 400, description = "`invalid_query`", body = Problem, content_type = "application/problem+json")
@@ -176,11 +199,12 @@ pub async fn create(
 pub async fn list(
     State(state): State<AppState>,
     caller: Caller,
-    ApiQuery(query): ApiQuery<PageQuery>,
+    ApiQuery(query): ApiQuery<KeysQuery>,
 ) -> Result<List<KeyView>, ApiError> {
     caller.require_all_plants()?;
-    let keys = state.store.keys(Some(caller.organisation), query.page()?).await?;
-    query.items("/api/v1/keys", keys, |key| key.seq, KeyView::from)
+    let (part, made) = (query.part(), TimeSpan { since: query.since, until: query.until });
+    let keys = state.store.keys(Some(caller.organisation), made, part.page()?).await?;
+    part.items(&query.path("/api/v1/keys"), keys, |key| key.seq, KeyView::from)
 }
 
 /// One key
@@ -266,13 +290,16 @@ pub async fn rotate(
 pub struct AuditView {
     #[schema(value_type = String, format = DateTime)]
     pub at: Timestamp,
-    /// The key that it was done with; left out where the service asks for no keys.
+    /// The key that it was done with; left out where it was done without one.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<Uuid>)]
     pub key: Option<KeyId>,
     /// What that key is called.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub key_name: Option<String>,
+    /// Whose token it was done with: the claim `sub` of the identity provider.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub subject: Option<String>,
     #[schema(example = "DELETE")]
     pub method: String,
     pub path: String,
@@ -290,6 +317,7 @@ impl From<AuditEntry> for AuditView {
             at: entry.at,
             key,
             key_name,
+            subject: entry.subject,
             method: entry.method,
             path: entry.path,
             status: entry.status,
@@ -304,7 +332,7 @@ impl From<AuditEntry> for AuditView {
     path = "/api/v1/audit",
     tag = "access",
     security(("key" = ["admin"])),
-    params(PageQuery),
+    params(AuditQuery),
     responses(
         (status = 200, body = List<AuditView>),
         (status = 400, description = "`invalid_query`", body = Problem, content_type = "application/problem+json")
@@ -313,9 +341,10 @@ impl From<AuditEntry> for AuditView {
 pub async fn audit(
     State(state): State<AppState>,
     caller: Caller,
-    ApiQuery(query): ApiQuery<PageQuery>,
+    ApiQuery(query): ApiQuery<AuditQuery>,
 ) -> Result<List<AuditView>, ApiError> {
     caller.require_all_plants()?;
-    let entries = state.store.audit(caller.organisation, query.page()?).await?;
-    query.items("/api/v1/audit", entries, |(seq, _)| *seq, |(_, entry)| entry.into())
+    let (part, within) = (query.part(), TimeSpan { since: query.since, until: query.until });
+    let entries = state.store.audit(caller.organisation, within, part.page()?).await?;
+    part.items(&query.path("/api/v1/audit"), entries, |(seq, _)| *seq, |(_, entry)| entry.into())
 }

@@ -10,6 +10,68 @@ use serde::{Deserialize, Serialize};
 const DEFAULT_LIMIT: u32 = 100;
 const MAX_LIMIT: u32 = 1000;
 
+/// Query parameters of a list that can be filtered: which part, and which items.
+macro_rules! filtered_list {
+    ($(#[$doc:meta])* $name:ident { $($(#[$about:meta])* $field:ident: $type:ty,)* }) => {
+        $(#[$doc])*
+        #[derive(Debug, serde::Deserialize, utoipa::IntoParams)]
+        #[serde(deny_unknown_fields)]
+        #[into_params(parameter_in = Query)]
+        pub struct $name {
+            /// Most items in the answer.
+            #[param(minimum = 1, maximum = 1000, default = 100)]
+            pub limit: Option<u32>,
+            /// Where to go on: taken from the link to the next part.
+            #[param(pattern = "^[0-9]{1,18}$")]
+            pub cursor: Option<String>,
+            $($(#[$about])* pub $field: Option<$type>,)*
+        }
+
+        impl $name {
+            /// Which part.
+            pub fn part(&self) -> $crate::http::paging::PageQuery {
+                $crate::http::paging::PageQuery { limit: self.limit, cursor: self.cursor.clone() }
+            }
+
+            /// The list's path with these filters.
+            pub fn path(&self, list: &str) -> String {
+                let filters: &[(&str, Option<String>)] =
+                    &[$((stringify!($field), self.$field.as_ref().map(ToString::to_string)),)*];
+                $crate::http::paging::with_filters(list, filters)
+            }
+        }
+    };
+}
+
+pub(super) use filtered_list;
+
+/// A list's path with what it is filtered by.
+pub fn with_filters(list: &str, filters: &[(&str, Option<String>)]) -> String {
+    let told = filters.iter().filter_map(|(name, value)| Some(format!("{name}={}", encoded(value.as_deref()?))));
+    let told: Vec<String> = told.collect();
+    if told.is_empty() { list.to_owned() } else { format!("{list}?{}", told.join("&")) }
+}
+
+/// A value as a URL's query may hold it (RFC 3986).
+fn encoded(value: &str) -> String {
+    let byte = |byte: u8| match byte {
+        b'A'..=b'Z' | b'a'..=b'z' | b'0'..=b'9' | b'-' | b'.' | b'_' | b'~' => char::from(byte).to_string(),
+        byte => format!("%{byte:02X}"),
+    };
+    value.bytes().map(byte).collect()
+}
+
+/// How a name must begin. What no name holds finds none, in every database.
+pub fn prefix_filter(asked: Option<&str>) -> String {
+    asked.unwrap_or_default().replace('\0', "\u{1}")
+}
+
+/// Reads a word that a list is filtered by, one of those of a state.
+pub fn state_filter<T: std::str::FromStr>(word: Option<&str>, words: &str) -> Result<Option<T>, ApiError> {
+    let wrong = |_| ApiError::new(Code::InvalidQuery, format!("state must be one of {words}"));
+    word.map(str::parse).transpose().map_err(wrong)
+}
+
 /// Which part of a list.
 #[derive(Debug, Deserialize, utoipa::IntoParams)]
 #[serde(deny_unknown_fields)]
@@ -92,5 +154,21 @@ impl<T: Serialize> IntoResponse for List<T> {
         let mut response = Json(self).into_response();
         response.headers_mut().extend(link);
         response
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn filters_stay_in_the_link_to_the_next_part() {
+        let path = with_filters("/list", &[("name", Some("A&b \u{e9}".to_owned())), ("state", None)]);
+        assert_eq!(path, "/list?name=A%26b%20%C3%A9");
+        let query = PageQuery { limit: Some(1), cursor: None };
+        let list = query.items(&path, vec![1, 2], |row| *row, |row| row).unwrap();
+        assert_eq!(list.next.as_deref(), Some("/list?name=A%26b%20%C3%A9&limit=1&cursor=1"));
+        let list = query.items("/list", vec![1, 2], |row| *row, |row| row).unwrap();
+        assert_eq!(list.next.as_deref(), Some("/list?limit=1&cursor=1"));
     }
 }

@@ -1,15 +1,16 @@
 //! Plants.
 
 use super::AppState;
+use super::conditional;
 use super::error::{ApiError, Code, Problem};
 use super::extract::{ApiJson, ApiPath, ApiQuery};
 use super::guard::Caller;
-use super::paging::{List, PageQuery};
+use super::paging::{List, filtered_list, prefix_filter};
 use crate::plant::PlantId;
 use crate::store::{Created, Plant};
 use axum::Json;
 use axum::extract::State;
-use axum::http::{StatusCode, header};
+use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -48,6 +49,15 @@ pub fn checked_name(name: &str) -> Result<&str, ApiError> {
     }
     Err(ApiError::new(Code::InvalidName, "a name has 1 to 200 characters and no line breaks"))
 }
+
+filtered_list!(
+    /// Which plants.
+    PlantsQuery {
+        /// Only those whose names begin so.
+        #[param(max_length = 200, example = "Sunfield")]
+        name: String,
+    }
+);
 
 /// The answer to a creation: 201 with its place, or 200 where it was there already.
 pub fn created_answer<T: Serialize>(location: String, new: bool, view: T) -> Response {
@@ -92,7 +102,7 @@ pub async fn create(
     path = "/api/v1/plants",
     tag = "plants",
     security(("key" = ["read"]), ("key" = ["review"]), ("key" = ["upload"])),
-    params(PageQuery),
+    params(PlantsQuery),
     responses(
         (status = 200, body = List<PlantView>),
         (status = 400, description = "`invalid_query`", body = Problem, content_type = "application/problem+json")
@@ -101,10 +111,11 @@ pub async fn create(
 pub async fn list(
     State(state): State<AppState>,
     caller: Caller,
-    ApiQuery(query): ApiQuery<PageQuery>,
+    ApiQuery(query): ApiQuery<PlantsQuery>,
 ) -> Result<List<PlantView>, ApiError> {
-    let plants = state.store.plants(caller.organisation, caller.plants.as_deref(), query.page()?).await?;
-    query.items("/api/v1/plants", plants, |plant| plant.seq, PlantView::from)
+    let (part, prefix) = (query.part(), prefix_filter(query.name.as_deref()));
+    let plants = state.store.plants(caller.organisation, caller.plants.as_deref(), &prefix, part.page()?).await?;
+    part.items(&query.path("/api/v1/plants"), plants, |plant| plant.seq, PlantView::from)
 }
 
 /// One plant
@@ -131,13 +142,24 @@ pub async fn get(State(state): State<AppState>, ApiPath(plant): ApiPath<PlantId>
     path = "/api/v1/plants/{plant}",
     tag = "plants",
     security(("key" = ["admin"])),
-    params(("plant" = Uuid, Path, description = "The plant's identifier")),
+    params(
+        ("plant" = Uuid, Path, description = "The plant's identifier"),
+        ("if-match" = Option<String>, Header, description = "Only as it was when it had one of these tags")
+    ),
     responses(
         (status = 204, description = "Nothing of it is left"),
+        (status = 412, description = "`precondition_failed`", body = Problem, content_type = "application/problem+json"),
         (status = 404, description = "`plant_not_found`", body = Problem, content_type = "application/problem+json")
     )
 )]
-pub async fn delete(State(state): State<AppState>, ApiPath(plant): ApiPath<PlantId>) -> Result<StatusCode, ApiError> {
+pub async fn delete(
+    State(state): State<AppState>,
+    ApiPath(plant): ApiPath<PlantId>,
+    headers: HeaderMap,
+) -> Result<StatusCode, ApiError> {
+    if conditional::is_asked(&headers) {
+        conditional::require(&headers, &PlantView::from(state.require_plant(plant).await?))?;
+    }
     state.store.delete_plant(plant, Timestamp::now()).await?;
     state.blobs.delete_plant(plant).await?;
     Ok(StatusCode::NO_CONTENT)

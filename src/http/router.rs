@@ -95,8 +95,8 @@ fn uploads() -> OpenApiRouter<AppState> {
         .routes(routes!(uploads::post_images))
         .routes(routes!(uploads::put_reconstruction, uploads::post_reconstruction))
         .routes(routes!(uploads::put_reconstruction_file))
-        .routes(routes!(tus::create, tus::options))
-        .routes(routes!(tus::head, tus::get, tus::patch, tus::terminate, tus::post))
+        .routes(routes!(tus::begin::create, tus::options))
+        .routes(routes!(tus::head, tus::get, tus::append::patch, tus::terminate, tus::post))
 }
 
 /// The description of the whole API.
@@ -146,7 +146,8 @@ pub fn router(state: AppState) -> Router {
 fn cors(network: &NetworkArgs) -> Option<CorsLayer> {
     let headers = ["authorization", "content-type", "content-digest", "if-match", "if-none-match", "repr-digest"];
     let headers = headers.into_iter().chain(["idempotency-key", "tus-resumable", "upload-checksum", "upload-concat"]);
-    let headers = headers.chain(["upload-length", "upload-metadata", "upload-offset", "x-http-method-override"]);
+    let headers =
+        headers.chain(["upload-length", "upload-metadata", "upload-offset", "x-http-method-override", "traceparent"]);
     let exposed = ["etag", "link", "location", "retry-after", "tus-extension", "tus-max-size", "tus-resumable"];
     let exposed = exposed.into_iter().chain(["tus-version", "upload-expires", "upload-offset", "x-request-id"]);
     let methods = [Method::GET, Method::HEAD, Method::POST, Method::PUT, Method::PATCH, Method::DELETE];

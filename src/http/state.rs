@@ -4,6 +4,7 @@ use super::error::{ApiError, Code};
 use super::rates::Rates;
 use super::tus::Desk;
 use crate::config::{Limits, NetworkArgs};
+use crate::oidc::Oidc;
 use crate::plant::PlantId;
 use crate::store::{Blobs, Plant, Store, Survey, SurveyId};
 use crate::telemetry::Metrics;
@@ -28,6 +29,8 @@ pub struct AppState {
     pub bell: Arc<Notify>,
     /// Raised when the service stops: answers without an end end then.
     pub stop: CancellationToken,
+    /// Checks tokens of an identity provider, where there is one.
+    pub oidc: Option<Arc<Oidc>>,
     /// Where webhooks may lead.
     pub targets: Targets,
     /// Whether anyone may do anything, without a key.
@@ -54,6 +57,7 @@ impl AppState {
             decoding: decoders(),
             bell: Arc::default(),
             stop: CancellationToken::new(),
+            oidc: None,
             targets: Targets::Public,
             insecure: false,
         }

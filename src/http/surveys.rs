@@ -1,14 +1,14 @@
 //! Surveys.
 
 use super::AppState;
-use super::error::{ApiError, Problem};
+use super::error::{ApiError, Code, Problem};
 use super::extract::{ApiJson, ApiPath, ApiQuery};
 use super::images::{self, FileView, ImagesSummary};
-use super::paging::{List, PageQuery};
+use super::paging::{List, filtered_list, prefix_filter};
 use super::plants::{checked_name, created_answer};
 use crate::jobs;
 use crate::plant::PlantId;
-use crate::store::{Created, FileRecord, Survey, SurveyId};
+use crate::store::{Created, FileKind, FileRecord, Survey, SurveyId};
 use axum::Json;
 use axum::extract::State;
 use axum::response::Response;
@@ -67,6 +67,25 @@ pub struct MissingView {
     pub message: String,
 }
 
+filtered_list!(
+    /// Which surveys.
+    SurveysQuery {
+        /// Only those whose names begin so.
+        #[param(max_length = 200, example = "2026-06")]
+        name: String,
+    }
+);
+
+/// Which files of a survey are told.
+#[derive(Debug, Deserialize, utoipa::IntoParams)]
+#[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
+pub struct FilesQuery {
+    /// Only files of this kind: `image` or `reconstruction`.
+    #[param(pattern = "^(image|reconstruction)$")]
+    pub kind: Option<String>,
+}
+
 /// What a survey with these files lacks.
 pub fn missing_views(files: &[FileRecord]) -> Vec<MissingView> {
     let view = |missing: jobs::Missing| MissingView { code: missing.code, message: missing.message };
@@ -109,7 +128,7 @@ pub async fn create(
     path = "/api/v1/plants/{plant}/surveys",
     tag = "surveys",
     security(("key" = ["read"]), ("key" = ["review"]), ("key" = ["upload"])),
-    params(("plant" = Uuid, Path, description = "The plant's identifier"), PageQuery),
+    params(("plant" = Uuid, Path, description = "The plant's identifier"), SurveysQuery),
     responses(
         (status = 200, body = List<SurveyView>),
         (status = "4XX", description = "`plant_not_found`, `invalid_query`", body = Problem,
@@ -119,12 +138,14 @@ pub async fn create(
 pub async fn list(
     State(state): State<AppState>,
     ApiPath(plant): ApiPath<PlantId>,
-    ApiQuery(query): ApiQuery<PageQuery>,
+    ApiQuery(query): ApiQuery<SurveysQuery>,
 ) -> Result<List<SurveyView>, ApiError> {
-    let page = query.page()?;
+    let (part, prefix) = (query.part(), prefix_filter(query.name.as_deref()));
+    let page = part.page()?;
     state.require_plant(plant).await?;
-    let surveys = state.store.surveys(plant, page).await?;
-    query.items(&format!("/api/v1/plants/{plant}/surveys"), surveys, |survey| survey.seq, SurveyView::from)
+    let surveys = state.store.surveys(plant, &prefix, page).await?;
+    let path = query.path(&format!("/api/v1/plants/{plant}/surveys"));
+    part.items(&path, surveys, |survey| survey.seq, SurveyView::from)
 }
 
 /// One survey: its files, and what is missing
@@ -135,21 +156,28 @@ pub async fn list(
     security(("key" = ["read"]), ("key" = ["review"]), ("key" = ["upload"])),
     params(
         ("plant" = Uuid, Path, description = "The plant's identifier"),
-        ("survey" = Uuid, Path, description = "The survey's identifier")
+        ("survey" = Uuid, Path, description = "The survey's identifier"),
+        FilesQuery
     ),
     responses(
         (status = 200, body = SurveyDetail),
-        (status = 404, description = "`plant_not_found`, `survey_not_found`", body = Problem,
+        (status = "4XX", description = "`plant_not_found`, `survey_not_found`, `invalid_query`", body = Problem,
             content_type = "application/problem+json")
     )
 )]
 pub async fn get(
     State(state): State<AppState>,
     ApiPath((plant, survey)): ApiPath<(PlantId, SurveyId)>,
+    ApiQuery(query): ApiQuery<FilesQuery>,
 ) -> Result<Json<SurveyDetail>, ApiError> {
+    let kinds = [FileKind::Image, FileKind::Reconstruction].map(FileKind::as_str);
+    if query.kind.as_deref().is_some_and(|kind| !kinds.contains(&kind)) {
+        return Err(ApiError::new(Code::InvalidQuery, format!("kind must be {}", kinds.join(" or "))));
+    }
     let survey = state.require_survey(plant, survey).await?;
     let files = state.store.files(survey.id).await?;
     let missing = missing_views(&files);
-    let (images, files) = images::summary(files);
+    let (images, mut files) = images::summary(files);
+    files.retain(|file| query.kind.as_deref().is_none_or(|kind| file.kind == kind));
     Ok(Json(SurveyDetail { survey: survey.into(), complete: missing.is_empty(), missing, images, files }))
 }

@@ -4,6 +4,7 @@
 //! fails leaves the survey as it was. Every upload may be repeated; the same bytes change nothing.
 
 use super::AppState;
+use super::conditional;
 use super::error::{ApiError, Code, Problem};
 use super::extract::ApiPath;
 use super::images::FileView;
@@ -66,12 +67,15 @@ pub fn uploaded(stored: Stored) -> UploadedFile {
     params(
         ("plant" = Uuid, Path, description = "The plant's identifier"),
         ("survey" = Uuid, Path, description = "The survey's identifier"),
-        ("name" = String, Path, description = "The photo's file name, as the reconstruction names it")
+        ("name" = String, Path, description = "The photo's file name, as the reconstruction names it"),
+        ("if-match" = Option<String>, Header, description = "Only over a file with one of these tags; `*` over any"),
+        ("if-none-match" = Option<String>, Header, pattern = "^\\*$", description = "`*`: only where no file is")
     ),
     request_body(content = Vec<u8>, content_type = "application/octet-stream", description = "A JPEG, PNG or TIFF file"),
     responses(
-        (status = 201, description = "Created", body = UploadedFile),
-        (status = 200, description = "Replaced, or unchanged", body = UploadedFile),
+        (status = 201, description = "Created", body = UploadedFile, headers(("etag" = String))),
+        (status = 200, description = "Replaced, or unchanged", body = UploadedFile, headers(("etag" = String))),
+        (status = 412, description = "`precondition_failed`", body = Problem, content_type = "application/problem+json"),
         (status = "4XX", description = "`plant_not_found`, `survey_not_found`, `invalid_name`, `too_large`, `image_too_large`, \
             `image_format_mismatch`, `image_unreadable`, `image_truncated`, `upload_interrupted`, `upload_stalled`, \
             `bad_request`, `checksum_mismatch`", body = Problem, content_type = "application/problem+json"),
@@ -103,12 +107,15 @@ pub async fn put_image(
     params(
         ("plant" = Uuid, Path, description = "The plant's identifier"),
         ("survey" = Uuid, Path, description = "The survey's identifier"),
-        ("path" = String, Path, description = "The file's place in OpenSfM's folder")
+        ("path" = String, Path, description = "The file's place in OpenSfM's folder"),
+        ("if-match" = Option<String>, Header, description = "Only over a file with one of these tags; `*` over any"),
+        ("if-none-match" = Option<String>, Header, pattern = "^\\*$", description = "`*`: only where no file is")
     ),
     request_body(content = Vec<u8>, content_type = "application/octet-stream", description = "The file"),
     responses(
-        (status = 201, description = "Created", body = UploadedFile),
-        (status = 200, description = "Replaced, or unchanged", body = UploadedFile),
+        (status = 201, description = "Created", body = UploadedFile, headers(("etag" = String))),
+        (status = 200, description = "Replaced, or unchanged", body = UploadedFile, headers(("etag" = String))),
+        (status = 412, description = "`precondition_failed`", body = Problem, content_type = "application/problem+json"),
         (status = "4XX", description = "`plant_not_found`, `survey_not_found`, `unknown_file`, `invalid_name`, `too_large`, \
             `file_unreadable`, `image_too_large`, `image_format_mismatch`, `image_unreadable`, `image_truncated`, \
             `upload_interrupted`, `upload_stalled`, `bad_request`, `checksum_mismatch`", body = Problem, content_type = "application/problem+json"),
@@ -136,21 +143,29 @@ async fn put_one(
     let mut body = body.into_data_stream();
     let stored = async {
         let place = place?;
+        let wanted = conditional::wanted(headers)?;
         state.require_survey(plant, survey).await?;
+        if let Some(wanted) = &wanted {
+            let there = state.store.file(survey, &place).await?.map(|file| file.sha256);
+            if !wanted.holds(there) {
+                return Err(conditional::failed());
+            }
+        }
         let limit = match place.content() {
             Content::Image => state.limits.max_image_size,
             Content::Json { .. } | Content::Ply => state.limits.max_file_size,
         };
         let staged = receive_body(state, place.as_str(), limit, headers, &mut body).await?;
         let checked = intake::check(state, place, staged).await?;
-        intake::store(state, plant, survey, vec![checked]).await
+        intake::store(state, plant, survey, vec![checked], wanted.as_ref()).await
     };
     match stored.await {
         Ok(stored) => {
             let new = stored.iter().any(|stored| stored.written == FileWritten::Created);
             let status = if new { StatusCode::CREATED } else { StatusCode::OK };
+            let tag = stored.first().map(|stored| [(header::ETAG, conditional::file_tag(stored.record.sha256))]);
             let file = stored.into_iter().next().map(uploaded);
-            Ok((status, Json(file)).into_response())
+            Ok((status, tag, Json(file)).into_response())
         }
         Err(problem) => {
             drain(&mut body, &problem).await;
@@ -243,7 +258,7 @@ pub async fn post_images(
             };
             let staged = receive(&mut part, state.blobs.staging(), bounds).await?;
             let checked = intake::check(&state, place, staged).await?;
-            intake::store(&state, plant, survey, vec![checked]).await
+            intake::store(&state, plant, survey, vec![checked], None).await
         };
         match stored.await {
             Ok(stored) => files.extend(stored.into_iter().map(uploaded)),
@@ -366,7 +381,7 @@ pub async fn store_archive(
         }
         checked.push(intake::check(state, place, staged).await?);
     }
-    let files = intake::store(state, plant, survey, checked).await?.into_iter().map(uploaded).collect();
+    let files = intake::store(state, plant, survey, checked, None).await?.into_iter().map(uploaded).collect();
     Ok(UploadedArchive { files, ignored_count, ignored })
 }
 

@@ -4,7 +4,7 @@ use super::AppState;
 use super::error::{ApiError, Code, Problem};
 use super::extract::{ApiJson, ApiPath, ApiQuery};
 use super::guard::Caller;
-use super::paging::{List, PageQuery};
+use super::paging::{List, PageQuery, filtered_list, state_filter};
 use crate::plant::PlantId;
 use crate::store::webhooks::MAX_WEBHOOKS;
 use crate::store::{Delivery, DeliveryId, DeliveryState, JobId, NewWebhook, SigningSecret, Webhook, WebhookId};
@@ -102,21 +102,14 @@ impl From<Delivery> for DeliveryView {
     }
 }
 
-/// Which messages.
-#[derive(Debug, Deserialize, utoipa::IntoParams)]
-#[serde(deny_unknown_fields)]
-#[into_params(parameter_in = Query)]
-pub struct DeliveriesQuery {
-    /// Most items in the answer.
-    #[param(minimum = 1, maximum = 1000, default = 100)]
-    pub limit: Option<u32>,
-    /// Where to go on: taken from the link to the next part.
-    #[param(pattern = "^[0-9]{1,18}$")]
-    pub cursor: Option<String>,
-    /// Only those in this state: `waiting`, `delivered` or `dead`.
-    #[param(pattern = "^(waiting|delivered|dead)$")]
-    pub state: Option<String>,
-}
+filtered_list!(
+    /// Which messages.
+    DeliveriesQuery {
+        /// Only those in this state: `waiting`, `delivered` or `dead`.
+        #[param(pattern = "^(waiting|delivered|dead)$")]
+        state: String,
+    }
+);
 
 fn no_webhook(id: WebhookId) -> ApiError {
     ApiError::new(Code::WebhookNotFound, format!("no webhook has the identifier {id}; GET /api/v1/webhooks lists them"))
@@ -263,14 +256,12 @@ pub async fn deliveries(
     ApiPath(id): ApiPath<WebhookId>,
     ApiQuery(query): ApiQuery<DeliveriesQuery>,
 ) -> Result<List<DeliveryView>, ApiError> {
-    let part = PageQuery { limit: query.limit, cursor: query.cursor };
-    let page = part.page()?;
-    let wanted = query.state.as_deref().map(str::parse::<DeliveryState>).transpose();
-    let wanted = wanted.map_err(|()| ApiError::new(Code::InvalidQuery, "state must be waiting, delivered or dead"))?;
+    let part = query.part();
+    let (page, wanted) =
+        (part.page()?, state_filter::<DeliveryState>(query.state.as_deref(), "waiting, delivered and dead")?);
     let webhook = require_webhook(&state, &caller, id).await?;
     let found = state.store.deliveries(webhook.id, wanted, page).await?;
-    let filter = wanted.map(|state| format!("?state={}", state.as_str())).unwrap_or_default();
-    let path = format!("/api/v1/webhooks/{id}/deliveries{filter}");
+    let path = query.path(&format!("/api/v1/webhooks/{id}/deliveries"));
     part.items(&path, found, |delivery| delivery.seq, DeliveryView::from)
 }
 

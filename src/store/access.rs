@@ -1,7 +1,7 @@
 //! Who may do what: organisations, their keys, and the log of what was done.
 
 use super::records::row_id;
-use super::{Created, Digest, Page, StoreError};
+use super::{Created, Digest, Page, StoreError, TimeSpan};
 use crate::plant::PlantId;
 use jiff::Timestamp;
 use std::collections::BTreeSet;
@@ -129,8 +129,10 @@ pub struct NewKey {
 pub struct AuditEntry {
     pub organisation: OrganisationId,
     pub at: Timestamp,
-    /// The key that it was done with, and what that was called; none where the service asks for no keys.
+    /// The key that it was done with, and what that was called; none where it was done without one.
     pub key: Option<(KeyId, String)>,
+    /// Whose token it was done with.
+    pub subject: Option<String>,
     pub method: String,
     pub path: String,
     /// The HTTP status of the answer.
@@ -144,12 +146,21 @@ pub trait AccessStore: Send + Sync + 'static {
     /// Creates an organisation, or finds the one of that name.
     async fn create_organisation(&self, name: &str, now: Timestamp) -> Result<Created<Organisation>, StoreError>;
 
+    /// The organisation of a name.
+    async fn organisation(&self, name: &str) -> Result<Option<Organisation>, StoreError>;
+
     /// Stores a key.
     async fn create_key(&self, key: &NewKey, now: Timestamp) -> Result<ApiKey, StoreError>;
     /// One key of an organisation, revoked and expired ones included.
     async fn key(&self, organisation: OrganisationId, id: KeyId) -> Result<Option<ApiKey>, StoreError>;
-    /// An organisation's keys, or everyone's, in the order of their creation, revoked and expired ones included.
-    async fn keys(&self, organisation: Option<OrganisationId>, page: Page) -> Result<Vec<ApiKey>, StoreError>;
+    /// An organisation's keys, or everyone's, that were made within a time, in the order of their creation, revoked and
+    /// expired ones included.
+    async fn keys(
+        &self,
+        organisation: Option<OrganisationId>,
+        made: TimeSpan,
+        page: Page,
+    ) -> Result<Vec<ApiKey>, StoreError>;
     /// The key with this secret that is good now.
     async fn key_of_secret(&self, sha256: Digest, now: Timestamp) -> Result<Option<ApiKey>, StoreError>;
     /// Makes a key good for nothing, for ever.
@@ -172,6 +183,11 @@ pub trait AccessStore: Send + Sync + 'static {
 
     /// Adds to the audit log.
     async fn record(&self, entry: &AuditEntry) -> Result<(), StoreError>;
-    /// An organisation's audit log, the newest first, each entry with its sequence number.
-    async fn audit(&self, organisation: OrganisationId, page: Page) -> Result<Vec<(i64, AuditEntry)>, StoreError>;
+    /// An organisation's audit log of a time, the newest first, each entry with its sequence number.
+    async fn audit(
+        &self,
+        organisation: OrganisationId,
+        within: TimeSpan,
+        page: Page,
+    ) -> Result<Vec<(i64, AuditEntry)>, StoreError>;
 }

@@ -27,7 +27,7 @@ pub use postgres::PostgresStore;
 pub use records::{
     BlobRecord, Cancelled, Checkpoint, Claim, Completed, Created, Ending, Enqueued, Feature, FeatureQuery, FileRecord,
     FileWritten, GeoBox, Heartbeat, Job, JobId, JobRequest, JobState, LayerInfo, Model, NewFeature, NewLayer, NewModel,
-    Page, Plant, Pool, Progress, Queue, Survey, SurveyId,
+    Page, Plant, Pool, Progress, Queue, Survey, SurveyId, TimeSpan, Wanted,
 };
 pub use requests::RequestStore;
 pub use secret::Secret;
@@ -109,11 +109,12 @@ pub trait Store: AccessStore + UploadStore + RequestStore + TaskStore + WebhookS
     ) -> Result<Created<Plant>, StoreError>;
     /// One plant, whoever owns it.
     async fn plant(&self, id: PlantId) -> Result<Option<Plant>, StoreError>;
-    /// An organisation's plants, or those of them that are in a list, in the order of their creation.
+    /// An organisation's plants, or those of them that are in a list, whose names begin so, in the order of their creation.
     async fn plants(
         &self,
         organisation: OrganisationId,
         only: Option<&[PlantId]>,
+        prefix: &str,
         page: Page,
     ) -> Result<Vec<Plant>, StoreError>;
     /// Deletes a plant with every row that belongs to it, and notes that its blobs are to go; whether there was one. Its
@@ -128,11 +129,18 @@ pub trait Store: AccessStore + UploadStore + RequestStore + TaskStore + WebhookS
     async fn create_survey(&self, plant: PlantId, name: &str, now: Timestamp) -> Result<Created<Survey>, StoreError>;
     /// One survey of a plant.
     async fn survey(&self, plant: PlantId, id: SurveyId) -> Result<Option<Survey>, StoreError>;
-    /// A plant's surveys in the order of their creation.
-    async fn surveys(&self, plant: PlantId, page: Page) -> Result<Vec<Survey>, StoreError>;
+    /// A plant's surveys whose names begin so, in the order of their creation.
+    async fn surveys(&self, plant: PlantId, prefix: &str, page: Page) -> Result<Vec<Survey>, StoreError>;
 
     /// Puts files into a survey, all or none; a file at the same path is replaced. One answer per file, in order.
     async fn put_files(&self, survey: SurveyId, files: &[FileRecord]) -> Result<Vec<FileWritten>, StoreError>;
+    /// As [`Self::put_files`] of one file, where what is at its path is as wanted; `None` where it is not.
+    async fn replace_file(
+        &self,
+        survey: SurveyId,
+        file: &FileRecord,
+        wanted: &Wanted,
+    ) -> Result<Option<FileWritten>, StoreError>;
     /// A survey's files, sorted by path.
     async fn files(&self, survey: SurveyId) -> Result<Vec<FileRecord>, StoreError>;
 
@@ -156,8 +164,14 @@ pub trait Store: AccessStore + UploadStore + RequestStore + TaskStore + WebhookS
     async fn enqueue_job(&self, request: &JobRequest, now: Timestamp) -> Result<Enqueued, StoreError>;
     /// One job of a plant.
     async fn job(&self, plant: PlantId, id: JobId) -> Result<Option<Job>, StoreError>;
-    /// A plant's jobs, or those of one survey, the newest first.
-    async fn jobs(&self, plant: PlantId, survey: Option<SurveyId>, page: Page) -> Result<Vec<Job>, StoreError>;
+    /// A plant's jobs, or those of one survey, or in one state, the newest first.
+    async fn jobs(
+        &self,
+        plant: PlantId,
+        survey: Option<SurveyId>,
+        state: Option<JobState>,
+        page: Page,
+    ) -> Result<Vec<Job>, StoreError>;
     /// Cancels a queued job at once, asks a running one to stop, leaves a finished one.
     async fn cancel_job(&self, plant: PlantId, id: JobId, now: Timestamp) -> Result<Option<Cancelled>, StoreError>;
 

@@ -44,6 +44,13 @@ pub struct Page {
     pub limit: u32,
 }
 
+/// A span of time: from its beginning on, until before its end; open where there is none.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct TimeSpan {
+    pub since: Option<Timestamp>,
+    pub until: Option<Timestamp>,
+}
+
 /// Something created, or found because it was there already.
 #[derive(Debug, Clone)]
 pub enum Created<T> {
@@ -94,6 +101,28 @@ pub struct BlobRecord {
     pub sha256: Digest,
     /// Bytes.
     pub size: u64,
+}
+
+/// What must be at a file's place for another to be put there.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Wanted {
+    /// Some file.
+    Anything,
+    /// Nothing.
+    Nothing,
+    /// A file with one of these digests.
+    OneOf(Vec<Digest>),
+}
+
+impl Wanted {
+    /// Whether a file with this digest, or nothing, is as wanted.
+    pub fn holds(&self, there: Option<Digest>) -> bool {
+        match (self, there) {
+            (Self::Anything, Some(_)) | (Self::Nothing, None) => true,
+            (Self::OneOf(digests), Some(there)) => digests.contains(&there),
+            _ => false,
+        }
+    }
 }
 
 /// What became of a file that was put.

@@ -86,7 +86,8 @@ pub const KEY: &str = concat!("SELECT ", key!(), " FROM api_keys WHERE organisat
 pub const KEYS: &str = concat!(
     "SELECT ",
     key!(),
-    " FROM api_keys WHERE organisation_id = COALESCE($1, organisation_id) AND seq > $2 ORDER BY seq LIMIT $3"
+    " FROM api_keys WHERE organisation_id = COALESCE($1, organisation_id) AND seq > $2 AND created_ms >= $4 \
+     AND created_ms < $5 ORDER BY seq LIMIT $3"
 );
 pub const KEY_OF_SECRET: &str = concat!(
     "SELECT ",
@@ -106,11 +107,11 @@ pub const ROTATE_KEY: &str = concat!(
 pub const KEY_USED: &str = "UPDATE api_keys SET last_used_ms = $2 WHERE id = $1";
 
 pub const RECORD: &str = "\
-    INSERT INTO audit (organisation_id, at_ms, key_id, key_name, method, path, status, request_id) \
-    VALUES ($1, $2, $3, $4, $5, $6, $7, $8)";
+    INSERT INTO audit (organisation_id, at_ms, key_id, key_name, method, path, status, request_id, subject) \
+    VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9)";
 pub const AUDIT: &str = "\
-    SELECT seq, organisation_id, at_ms, key_id, key_name, method, path, status, request_id FROM audit \
-    WHERE organisation_id = $1 AND seq < $2 ORDER BY seq DESC LIMIT $3";
+    SELECT seq, organisation_id, at_ms, key_id, key_name, method, path, status, request_id, subject FROM audit \
+    WHERE organisation_id = $1 AND seq < $2 AND at_ms >= $4 AND at_ms < $5 ORDER BY seq DESC LIMIT $3";
 
 pub const CREATE_PLANT: &str = concat!(
     "INSERT INTO plants (id, organisation_id, name, created_ms) VALUES ($1, $2, $3, $4) \
@@ -124,7 +125,7 @@ pub const PLANTS: &str = concat!(
     "SELECT ",
     plant!(),
     " FROM plants WHERE organisation_id = $1 AND COALESCE($2, id) LIKE '%' || id || '%' AND seq > $3 \
-     ORDER BY seq LIMIT $4"
+     AND SUBSTR(name, 1, LENGTH($5)) = $5 ORDER BY seq LIMIT $4"
 );
 pub const DELETE_PLANT: &str = "DELETE FROM plants WHERE id = $1";
 pub const NOTE_DELETED_PLANT: &str =
@@ -139,16 +140,20 @@ pub const CREATE_SURVEY: &str = concat!(
 );
 pub const SURVEY_BY_NAME: &str = concat!("SELECT ", survey!(), " FROM surveys WHERE plant_id = $1 AND name = $2");
 pub const SURVEY: &str = concat!("SELECT ", survey!(), " FROM surveys WHERE plant_id = $1 AND id = $2");
-pub const SURVEYS: &str =
-    concat!("SELECT ", survey!(), " FROM surveys WHERE plant_id = $1 AND seq > $2 ORDER BY seq LIMIT $3");
+pub const SURVEYS: &str = concat!(
+    "SELECT ",
+    survey!(),
+    " FROM surveys WHERE plant_id = $1 AND seq > $2 AND SUBSTR(name, 1, LENGTH($4)) = $4 ORDER BY seq LIMIT $3"
+);
 
 pub const FILE_DIGEST: &str = "SELECT sha256 FROM files WHERE survey_id = $1 AND path = $2";
+/// Over what is there only where that has the digest `$11`, or where none is given.
 pub const PUT_FILE: &str = "\
     INSERT INTO files (survey_id, path, kind, size, sha256, width_px, height_px, photo, shots, stored_ms) \
     VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10) \
     ON CONFLICT (survey_id, path) DO UPDATE SET kind = excluded.kind, size = excluded.size, sha256 = excluded.sha256, \
     width_px = excluded.width_px, height_px = excluded.height_px, photo = excluded.photo, shots = excluded.shots, \
-    stored_ms = excluded.stored_ms";
+    stored_ms = excluded.stored_ms WHERE files.sha256 = COALESCE($11, files.sha256)";
 /// What older versions did not look for.
 pub const COMPLETE_FILE: &str = "\
     UPDATE files SET photo = $3, shots = $4 WHERE survey_id = $1 AND path = $2 AND photo IS NULL AND shots IS NULL";
@@ -249,12 +254,16 @@ pub const ENQUEUE_JOB: &str = concat!(
 pub const UNFINISHED_JOB: &str =
     concat!("SELECT ", job!(), " FROM jobs WHERE survey_id = $1 AND state IN ('queued', 'running')");
 pub const JOB: &str = concat!("SELECT ", job!(), " FROM jobs WHERE plant_id = $1 AND id = $2");
-pub const JOBS_OF_PLANT: &str =
-    concat!("SELECT ", job!(), " FROM jobs WHERE plant_id = $1 AND seq < $2 ORDER BY seq DESC LIMIT $3");
+pub const JOBS_OF_PLANT: &str = concat!(
+    "SELECT ",
+    job!(),
+    " FROM jobs WHERE plant_id = $1 AND seq < $2 AND state = COALESCE($4, state) ORDER BY seq DESC LIMIT $3"
+);
 pub const JOBS_OF_SURVEY: &str = concat!(
     "SELECT ",
     job!(),
-    " FROM jobs WHERE plant_id = $1 AND survey_id = $4 AND seq < $2 ORDER BY seq DESC LIMIT $3"
+    " FROM jobs WHERE plant_id = $1 AND survey_id = $5 AND seq < $2 AND state = COALESCE($4, state) \
+     ORDER BY seq DESC LIMIT $3"
 );
 pub const CANCEL_JOB: &str = concat!(
     "UPDATE jobs SET cancel_requested = TRUE, \

@@ -6,6 +6,7 @@ use heliomap::detection::{Detector, ImageDetections};
 use heliomap::geometry::{GeodeticReference, Lla};
 use heliomap::http::{AppState, router, serve};
 use heliomap::jobs::{FoundInTask, Mapper, NextTask, PipelineMapper, Stopped, Worker, WorkerSettings};
+use heliomap::oidc::Oidc;
 use heliomap::pipeline::{Found, MapError, MapOptions, Observer, Stage, Subject};
 use heliomap::plant::{
     Bench, BenchId, Line, LineId, Module, ModuleId, ModuleStatus, PlantId, PlantModel, Sector, SectorId, Warning,
@@ -344,6 +345,19 @@ impl App {
         let new = NewKey { organisation, name, secret: secret.record(), scopes, plants, expires: None };
         self.store.create_key(&new, now).await.unwrap();
         secret.reveal().to_owned()
+    }
+
+    /// That takes tokens of an identity provider beside keys.
+    pub async fn with_oidc(oidc: Oidc) -> Self {
+        let mut app = Self::with_keys_and_limits(Limits::default()).await;
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+        app.base = format!("http://{}", listener.local_addr().unwrap());
+        let limits = Limits::default();
+        let state = AppState::new(app.store.clone(), app.blobs.clone(), limits.clone());
+        let state = AppState { oidc: Some(Arc::new(oidc)), stop: app.cancelled.clone(), ..state };
+        let stop = app.cancelled.clone();
+        tokio::spawn(async move { serve(listener, router(state), &limits, stop).await });
+        app
     }
 
     /// With a worker that maps in earnest, by this detector.

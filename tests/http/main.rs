@@ -5,12 +5,14 @@ mod app;
 #[path = "../common/boxes.rs"]
 mod boxes;
 mod broken;
+mod conditions;
 mod contract;
 mod idempotency;
 mod images;
 mod jobs;
 mod limits;
 mod models;
+mod oidc;
 mod plants;
 mod quotas;
 mod reconstruction;

@@ -47,7 +47,10 @@ fn a_service_that_is_well() {
     let (well, checks) = examine(data.path(), &[], &[]);
     assert!(well, "{checks:?}");
     let verdicts: Vec<_> = checks.iter().map(|check| check["name"].as_str().unwrap()).collect();
-    assert_eq!(verdicts, ["configuration", "data folder", "database", "storage", "detector", "certificates"]);
+    assert_eq!(
+        verdicts,
+        ["configuration", "data folder", "database", "storage", "detector", "certificates", "identity provider"]
+    );
     // A machine may have no certificates of public authorities.
     for check in &checks[..5] {
         assert_eq!(check["verdict"], "ok", "{check}");
@@ -81,6 +84,8 @@ fn each_thing_that_is_wrong_is_named() {
     assert_fails(ask(&["--detector", "/nowhere.onnx"]), "detector", "nowhere.onnx");
     let library = [("ORT_DYLIB_PATH", "/nowhere/libonnxruntime.so")];
     assert_fails(examine(data.path(), &library, &[]), "detector", "/nowhere/libonnxruntime.so");
+    let provider = ["--oidc-issuer", "http://127.0.0.1:9", "--oidc-audience", "heliomap"];
+    assert_fails(ask(&provider), "identity provider", "http://127.0.0.1:9");
     let unreachable = ["--database", "postgres://heliomap:pa55w0rd@127.0.0.1:9/heliomap"];
     let outcome = ask(&unreachable);
     assert!(!format!("{outcome:?}").contains("pa55w0rd"), "{outcome:?}");

@@ -8,8 +8,8 @@ use heliomap::store::{
     AuditEntry, Cancelled, Checkpoint, Claim, Completed, Created, DeliveryState, Digest, Ending, Enqueued,
     FeatureQuery, FileRecord, FileWritten, GeoBox, GivenBack, Heartbeat, ImageTask, Job, JobId, JobRequest, JobState,
     KeyId, NewFeature, NewKey, NewLayer, NewModel, NewWebhook, OrganisationId, OwnTask, Page, Plant, Progress, Quotas,
-    Scope, SecretRecord, Sent, SigningSecret, Store, StoreError, Survey, SurveyId, SurveyPath, Upload, UploadId, Usage,
-    Webhook, WebhookId,
+    Scope, SecretRecord, Sent, SigningSecret, Store, StoreError, Survey, SurveyId, SurveyPath, TimeSpan, Upload,
+    UploadId, Usage, Wanted, Webhook, WebhookId,
 };
 use jiff::Timestamp;
 use std::time::Duration;
@@ -93,7 +93,7 @@ pub async fn plants_and_surveys(store: &dyn Store) {
     assert_eq!(store.plant(b.id).await.unwrap().unwrap().name, "B");
     assert!(store.plant(PlantId(Uuid::nil())).await.unwrap().is_none());
     let names = async |page| {
-        store.plants(ORGANISATION, None, page).await.unwrap().into_iter().map(|p| p.name).collect::<Vec<_>>()
+        store.plants(ORGANISATION, None, "", page).await.unwrap().into_iter().map(|p| p.name).collect::<Vec<_>>()
     };
     assert_eq!(names(Page { after: None, limit: 1 }).await, ["A"]);
     assert_eq!(names(Page { after: Some(a.seq), limit: 9 }).await, ["B"]);
@@ -103,7 +103,7 @@ pub async fn plants_and_surveys(store: &dyn Store) {
     assert_ne!(survey(store, b.id, "June").await.id, june.id);
     assert_eq!(survey(store, a.id, "June").await.id, june.id);
     assert!(store.survey(b.id, july.id).await.unwrap().is_none());
-    assert_eq!(store.surveys(a.id, ALL).await.unwrap().len(), 2);
+    assert_eq!(store.surveys(a.id, "", ALL).await.unwrap().len(), 2);
     let nobody = store.create_survey(PlantId(Uuid::nil()), "June", at(0)).await;
     assert!(matches!(nobody, Err(StoreError::Gone { what: "plant" })));
 }
@@ -172,11 +172,15 @@ pub async fn one_unfinished_job_per_survey(store: &dyn Store) {
     let failed = Ending::Failed { code: "code".to_owned(), message: "message".to_owned() };
     assert!(store.end_job(&claim, &failed, at(2)).await.unwrap());
     assert!(matches!(store.enqueue_job(&request, at(3)).await.unwrap(), Enqueued::New(new) if new.id != job.id));
-    let jobs = store.jobs(survey.plant, None, ALL).await.unwrap();
+    let jobs = store.jobs(survey.plant, None, None, ALL).await.unwrap();
     assert_eq!((jobs.len(), jobs[1].id), (2, job.id));
     assert_eq!(jobs[1].error, Some(("code".to_owned(), "message".to_owned())));
     assert_eq!(
-        store.jobs(survey.plant, Some(survey.id), Page { after: Some(jobs[0].seq), limit: 9 }).await.unwrap().len(),
+        store
+            .jobs(survey.plant, Some(survey.id), None, Page { after: Some(jobs[0].seq), limit: 9 })
+            .await
+            .unwrap()
+            .len(),
         1
     );
 }
@@ -403,7 +407,7 @@ pub async fn organisations_and_their_plants(store: &dyn Store) {
         panic!("it is new")
     };
     let ids = async |organisation, only: Option<&[PlantId]>| -> Vec<PlantId> {
-        store.plants(organisation, only, ALL).await.unwrap().iter().map(|plant| plant.id).collect()
+        store.plants(organisation, only, "", ALL).await.unwrap().iter().map(|plant| plant.id).collect()
     };
     assert_eq!(ids(a, None).await, [one.id, more.id]);
     assert_eq!(ids(b, None).await, [two.id]);
@@ -440,9 +444,9 @@ pub async fn keys(store: &dyn Store) {
     store.key_used(key.id, at(5)).await.unwrap();
     assert_eq!(store.key(a, key.id).await.unwrap().unwrap().last_used, Some(at(5)));
     assert!(store.key(b, key.id).await.unwrap().is_none());
-    assert_eq!(store.keys(Some(a), ALL).await.unwrap().len(), 2);
-    assert_eq!(store.keys(None, Page { after: Some(key.seq), limit: 9 }).await.unwrap().len(), 1);
-    assert!(store.keys(Some(b), ALL).await.unwrap().is_empty());
+    assert_eq!(store.keys(Some(a), TimeSpan::default(), ALL).await.unwrap().len(), 2);
+    assert_eq!(store.keys(None, TimeSpan::default(), Page { after: Some(key.seq), limit: 9 }).await.unwrap().len(), 1);
+    assert!(store.keys(Some(b), TimeSpan::default(), ALL).await.unwrap().is_empty());
 
     assert!(store.rotate_key(b, key.id, &secret("two"), at(20)).await.unwrap().is_none());
     let rotated = store.rotate_key(a, key.id, &secret("two"), at(20)).await.unwrap().unwrap();
@@ -463,6 +467,7 @@ pub async fn audit_log(store: &dyn Store) {
         organisation,
         at: at(second),
         key,
+        subject: (second == 1).then(|| "pilot-7".to_owned()),
         method: "DELETE".to_owned(),
         path: format!("/{second}"),
         status: 204,
@@ -472,11 +477,12 @@ pub async fn audit_log(store: &dyn Store) {
     for entry in [entry(a, 1, None), entry(b, 2, None), entry(a, 3, Some(key.clone()))] {
         store.record(&entry).await.unwrap();
     }
-    let log = store.audit(a, ALL).await.unwrap();
+    let log = store.audit(a, TimeSpan::default(), ALL).await.unwrap();
     let seen: Vec<(&str, u16)> = log.iter().map(|(_, entry)| (entry.path.as_str(), entry.status)).collect();
     assert_eq!(seen, [("/3", 204), ("/1", 204)]);
     assert_eq!((&log[0].1.key, &log[1].1.key, log[0].1.at), (&Some(key), &None, at(3)));
-    let rest = store.audit(a, Page { after: Some(log[0].0), limit: 9 }).await.unwrap();
+    assert_eq!((&log[0].1.subject, log[1].1.subject.as_deref()), (&None, Some("pilot-7")));
+    let rest = store.audit(a, TimeSpan::default(), Page { after: Some(log[0].0), limit: 9 }).await.unwrap();
     assert_eq!(rest.len(), 1);
 }
 
@@ -923,4 +929,88 @@ pub async fn images_go_with_their_job(store: &dyn Store) {
     store.offer_tasks(&third, "f", "v", &tasks(&["a"])).await.unwrap();
     store.delete_plant(survey.plant, at(51)).await.unwrap();
     assert_eq!(store.waiting_tasks(at(51)).await.unwrap(), 0);
+}
+
+pub async fn a_file_is_replaced_only_where_it_is_as_wanted(store: &dyn Store) {
+    let survey = survey(store, plant(store, "A").await.id, "June").await;
+    let put = async |content: &str, wanted: Wanted| {
+        store.replace_file(survey.id, &file("images/a.jpg", content), &wanted).await.unwrap()
+    };
+    let of = |content: &str| Wanted::OneOf(vec![Digest::of(b"other"), Digest::of(content.as_bytes())]);
+    assert_eq!(put("1", Wanted::Anything).await, None);
+    assert_eq!(put("1", of("1")).await, None);
+    assert_eq!(put("1", Wanted::Nothing).await, Some(FileWritten::Created));
+    assert_eq!(put("2", Wanted::Nothing).await, None);
+    assert_eq!(put("2", of("3")).await, None);
+    assert_eq!(put("2", of("1")).await, Some(FileWritten::Replaced));
+    assert_eq!(put("2", of("2")).await, Some(FileWritten::Unchanged));
+    assert_eq!(put("3", Wanted::Anything).await, Some(FileWritten::Replaced));
+    assert_eq!(store.files(survey.id).await.unwrap()[0].sha256, Digest::of(b"3"));
+
+    // Of many who saw the same and replace it at once, one does.
+    let many = (0..8).map(|number| {
+        let replaced = file("images/a.jpg", &format!("by {number}"));
+        async move { store.replace_file(survey.id, &replaced, &of("3")).await.unwrap() }
+    });
+    let outcomes = futures::future::join_all(many).await;
+    assert_eq!(outcomes.iter().filter(|outcome| outcome.is_some()).count(), 1, "{outcomes:?}");
+}
+
+pub async fn lists_are_filtered(store: &dyn Store) {
+    let (a, _, c) = (plant(store, "Sun 1").await, plant(store, "Hill").await, plant(store, "Sun 2").await);
+    let plants = async |prefix: &str| {
+        let found = store.plants(ORGANISATION, None, prefix, ALL).await.unwrap();
+        found.into_iter().map(|plant| plant.id).collect::<Vec<_>>()
+    };
+    assert_eq!((plants("Sun").await, plants("sun").await, plants("%").await), (vec![a.id, c.id], vec![], vec![]));
+    let (june, july) = (survey(store, a.id, "June").await, survey(store, a.id, "July").await);
+    let surveys = async |prefix: &str| store.surveys(a.id, prefix, ALL).await.unwrap().len();
+    assert_eq!((surveys("Ju").await, surveys("Jun").await, surveys("X").await), (2, 1, 0));
+
+    let cancelled = enqueue(store, &june).await;
+    store.cancel_job(a.id, cancelled.id, at(1)).await.unwrap();
+    let queued = enqueue(store, &july).await;
+    let jobs = async |survey: Option<SurveyId>, state: Option<JobState>| {
+        let found = store.jobs(a.id, survey, state, ALL).await.unwrap();
+        found.into_iter().map(|job| job.id).collect::<Vec<_>>()
+    };
+    assert_eq!(jobs(None, None).await, [queued.id, cancelled.id]);
+    assert_eq!(jobs(None, Some(JobState::Cancelled)).await, [cancelled.id]);
+    assert_eq!(jobs(Some(june.id), Some(JobState::Queued)).await, []);
+    assert_eq!(jobs(Some(july.id), Some(JobState::Queued)).await, [queued.id]);
+
+    let entry = |second| AuditEntry {
+        organisation: ORGANISATION,
+        at: at(second),
+        key: None,
+        subject: None,
+        method: "DELETE".to_owned(),
+        path: format!("/{second}"),
+        status: 204,
+        request_id: "r".to_owned(),
+    };
+    for second in 1..=4 {
+        store.record(&entry(second)).await.unwrap();
+    }
+    let audit = async |since: Option<i64>, until: Option<i64>| {
+        let within = TimeSpan { since: since.map(at), until: until.map(at) };
+        let found = store.audit(ORGANISATION, within, ALL).await.unwrap();
+        found.into_iter().map(|(_, entry)| entry.path).collect::<Vec<_>>()
+    };
+    assert_eq!(audit(Some(2), Some(4)).await, ["/3", "/2"]);
+    assert_eq!((audit(Some(5), None).await.len(), audit(None, Some(2)).await.len()), (0, 1));
+    for second in [10, 20] {
+        let new = NewKey {
+            organisation: ORGANISATION,
+            name: second.to_string(),
+            secret: SecretRecord { sha256: Digest::of(&[second as u8]), prefix: "hm_".to_owned() },
+            scopes: [Scope::Read].into(),
+            plants: None,
+            expires: None,
+        };
+        store.create_key(&new, at(second)).await.unwrap();
+    }
+    let within = TimeSpan { since: Some(at(10)), until: Some(at(20)) };
+    let keys = store.keys(Some(ORGANISATION), within, ALL).await.unwrap();
+    assert_eq!(keys.iter().map(|key| key.name.as_str()).collect::<Vec<_>>(), ["10"]);
 }

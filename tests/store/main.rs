@@ -66,6 +66,8 @@ on_both!(
     a_deleted_plant_takes_everything_with_it,
     boxes_find_what_touches_them,
     quotas,
+    a_file_is_replaced_only_where_it_is_as_wanted,
+    lists_are_filtered,
     webhooks,
     messages_are_sent_by_one_at_a_time_and_not_for_ever,
     blobs_that_rows_name,
@@ -98,11 +100,11 @@ async fn what_was_there_before_is_kept() {
     pool.close().await;
     let store = SqliteStore::open(&file).await.unwrap();
     let all = Page { after: None, limit: 9 };
-    let plants = store.plants(OrganisationId::DEFAULT, None, all).await.unwrap();
+    let plants = store.plants(OrganisationId::DEFAULT, None, "", all).await.unwrap();
     assert_eq!((plants.len(), plants[0].id.to_string().as_str()), (1, plant));
-    assert_eq!(store.surveys(plants[0].id, all).await.unwrap().len(), 1);
+    assert_eq!(store.surveys(plants[0].id, "", all).await.unwrap().len(), 1);
     assert!(store.delete_plant(plants[0].id, jiff::Timestamp::UNIX_EPOCH).await.unwrap());
-    assert!(store.surveys(plants[0].id, all).await.unwrap().is_empty());
+    assert!(store.surveys(plants[0].id, "", all).await.unwrap().is_empty());
 }
 
 #[tokio::test]

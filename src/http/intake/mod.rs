@@ -6,10 +6,11 @@ pub mod digest;
 pub mod receive;
 mod shots;
 
+use super::conditional;
 use super::error::{ApiError, Code};
 use super::state::AppState;
 use crate::plant::PlantId;
-use crate::store::{FileKind, FileRecord, FileWritten, StagedFile, SurveyId, SurveyPath};
+use crate::store::{FileKind, FileRecord, FileWritten, StagedFile, SurveyId, SurveyPath, Wanted};
 use content::Found;
 use jiff::Timestamp;
 use std::path::Path;
@@ -50,12 +51,14 @@ pub async fn check(state: &AppState, path: SurveyPath, staged: StagedFile) -> Re
     work.await.unwrap_or_else(|error| Err(ApiError::internal(&error)))
 }
 
-/// Stores files that were checked: first their bytes, then all rows at once.
+/// Stores files that were checked: first their bytes, then all rows at once. A single one may be wanted only where what is at
+/// its place is so.
 pub async fn store(
     state: &AppState,
     plant: PlantId,
     survey: SurveyId,
     files: Vec<Checked>,
+    wanted: Option<&Wanted>,
 ) -> Result<Vec<Stored>, ApiError> {
     // As exact as the store keeps it, so that every answer says the same.
     let now = Timestamp::now();
@@ -68,7 +71,15 @@ pub async fn store(
         records.push(FileRecord { path, size: staged.size, sha256: staged.sha256, size_px, photo, shots, stored });
         state.blobs.put_file(plant, staged).await?;
     }
-    let written = match state.store.put_files(survey, &records).await {
+    let written = match (wanted, records.as_slice()) {
+        (Some(wanted), [record]) => match state.store.replace_file(survey, record, wanted).await {
+            Ok(Some(written)) => Ok(vec![written]),
+            Ok(None) => return Err(conditional::failed()),
+            Err(error) => Err(error),
+        },
+        (_, records) => state.store.put_files(survey, records).await,
+    };
+    let written = match written {
         Ok(written) => written,
         Err(error) => {
             // The plant went while its files came: they go too.

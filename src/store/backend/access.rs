@@ -5,7 +5,7 @@ use super::read::{audit_entry, key, organisation};
 use crate::plant::PlantId;
 use crate::store::{
     AccessStore, ApiKey, AuditEntry, Created, Digest, KeyId, NewKey, Organisation, OrganisationId, Page, SecretRecord,
-    StoreError, sql,
+    StoreError, TimeSpan, sql,
 };
 use async_trait::async_trait;
 use jiff::Timestamp;
@@ -33,6 +33,11 @@ impl AccessStore for Rows {
         Ok(created)
     }
 
+    async fn organisation(&self, name: &str) -> Result<Option<Organisation>, StoreError> {
+        let query = sqlx::query(sql::ORGANISATION_BY_NAME).bind(name);
+        query.fetch_optional(&self.read).await?.as_ref().map(organisation).transpose()
+    }
+
     async fn create_key(&self, new: &NewKey, now: Timestamp) -> Result<ApiKey, StoreError> {
         let words: Vec<&str> = new.scopes.iter().map(|scope| scope.as_str()).collect();
         let row = sqlx::query(sql::CREATE_KEY)
@@ -56,11 +61,19 @@ impl AccessStore for Rows {
         query.fetch_optional(&self.read).await?.as_ref().map(key).transpose()
     }
 
-    async fn keys(&self, organisation: Option<OrganisationId>, page: Page) -> Result<Vec<ApiKey>, StoreError> {
+    async fn keys(
+        &self,
+        organisation: Option<OrganisationId>,
+        made: TimeSpan,
+        page: Page,
+    ) -> Result<Vec<ApiKey>, StoreError> {
+        let (since_ms, until_ms) = span_ms(made);
         let query = sqlx::query(sql::KEYS)
             .bind(organisation.map(|id| id.to_string()))
             .bind(page.after.unwrap_or(0))
-            .bind(i64::from(page.limit));
+            .bind(i64::from(page.limit))
+            .bind(since_ms)
+            .bind(until_ms);
         query.fetch_all(&self.read).await?.iter().map(key).collect()
     }
 
@@ -112,19 +125,35 @@ impl AccessStore for Rows {
             .bind(&entry.path)
             .bind(i64::from(entry.status))
             .bind(&entry.request_id)
+            .bind(&entry.subject)
             .execute(&self.write)
             .await?;
         Ok(())
     }
 
-    async fn audit(&self, organisation: OrganisationId, page: Page) -> Result<Vec<(i64, AuditEntry)>, StoreError> {
+    async fn audit(
+        &self,
+        organisation: OrganisationId,
+        within: TimeSpan,
+        page: Page,
+    ) -> Result<Vec<(i64, AuditEntry)>, StoreError> {
+        let (since_ms, until_ms) = span_ms(within);
         let query = sqlx::query(sql::AUDIT)
             .bind(organisation.to_string())
             .bind(page.after.unwrap_or(i64::MAX))
-            .bind(i64::from(page.limit));
+            .bind(i64::from(page.limit))
+            .bind(since_ms)
+            .bind(until_ms);
         let rows = query.fetch_all(&self.read).await?;
         rows.iter().map(|row| Ok((row.try_get("seq")?, audit_entry(row)?))).collect()
     }
+}
+
+/// The first millisecond of a span of time, and the first after it.
+fn span_ms(span: TimeSpan) -> (i64, i64) {
+    // A time between two milliseconds is before all of the next.
+    let ms = |time: Timestamp| time.as_millisecond() + i64::from(time.subsec_nanosecond().rem_euclid(1_000_000) != 0);
+    (span.since.map_or(i64::MIN, ms), span.until.map_or(i64::MAX, ms))
 }
 
 /// Identifiers as a row holds them.

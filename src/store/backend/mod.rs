@@ -15,7 +15,7 @@ use super::super::{
     BlobRecord, Cancelled, Checkpoint, Claim, Completed, Created, Digest, Ending, Enqueued, Feature, FeatureQuery,
     FileRecord, FileWritten, GeoBox, Heartbeat, Job, JobId, JobRequest, JobState, LayerInfo, Model, NewFeature,
     NewModel, OrganisationId, Page, Plant, Pool, Progress, Queue, Quotas, Store, StoreError, Survey, SurveyId,
-    SurveyPath, TaskStore,
+    SurveyPath, TaskStore, Wanted,
 };
 use super::{Row, Rows, Tx};
 use crate::plant::{Layer, ModuleId, PlantId};
@@ -81,13 +81,15 @@ impl Store for Rows {
         &self,
         organisation: OrganisationId,
         only: Option<&[PlantId]>,
+        prefix: &str,
         page: Page,
     ) -> Result<Vec<Plant>, StoreError> {
         let query = sqlx::query(sql::PLANTS)
             .bind(organisation.to_string())
             .bind(only.map(access::plants_text))
             .bind(page.after.unwrap_or(0))
-            .bind(i64::from(page.limit));
+            .bind(i64::from(page.limit))
+            .bind(prefix);
         query.fetch_all(&self.read).await?.iter().map(plant).collect()
     }
 
@@ -138,9 +140,12 @@ impl Store for Rows {
         query.fetch_optional(&self.read).await?.as_ref().map(survey).transpose()
     }
 
-    async fn surveys(&self, plant: PlantId, page: Page) -> Result<Vec<Survey>, StoreError> {
-        let query =
-            sqlx::query(sql::SURVEYS).bind(plant.to_string()).bind(page.after.unwrap_or(0)).bind(i64::from(page.limit));
+    async fn surveys(&self, plant: PlantId, prefix: &str, page: Page) -> Result<Vec<Survey>, StoreError> {
+        let query = sqlx::query(sql::SURVEYS)
+            .bind(plant.to_string())
+            .bind(page.after.unwrap_or(0))
+            .bind(i64::from(page.limit))
+            .bind(prefix);
         query.fetch_all(&self.read).await?.iter().map(survey).collect()
     }
 
@@ -148,45 +153,21 @@ impl Store for Rows {
         let mut tx = self.begin().await?;
         let mut written = Vec::with_capacity(files.len());
         for file in files {
-            let before: Option<String> = sqlx::query_scalar(sql::FILE_DIGEST)
-                .bind(survey.to_string())
-                .bind(file.path.as_str())
-                .fetch_optional(&mut *tx)
-                .await?;
-            let digest = file.sha256.to_string();
-            let verdict = match before {
-                Some(before) if before == digest => FileWritten::Unchanged,
-                Some(_) => FileWritten::Replaced,
-                None => FileWritten::Created,
-            };
-            let photo = file.photo.as_ref().map(|photo| serde_json::json!(photo).to_string());
-            let shots = file.shots.as_ref().map(|shots| serde_json::json!(shots).to_string());
-            if verdict == FileWritten::Unchanged {
-                sqlx::query(sql::COMPLETE_FILE)
-                    .bind(survey.to_string())
-                    .bind(file.path.as_str())
-                    .bind(photo)
-                    .bind(shots)
-                    .execute(&mut *tx)
-                    .await?;
-            } else {
-                sqlx::query(sql::PUT_FILE)
-                    .bind(survey.to_string())
-                    .bind(file.path.as_str())
-                    .bind(file.path.kind().as_str())
-                    .bind(file.size as i64)
-                    .bind(digest)
-                    .bind(file.size_px.map(|size| i64::from(size[0])))
-                    .bind(file.size_px.map(|size| i64::from(size[1])))
-                    .bind(photo)
-                    .bind(shots)
-                    .bind(file.stored.as_millisecond())
-                    .execute(&mut *tx)
-                    .await
-                    .map_err(gone("survey"))?;
-            }
-            written.push(verdict);
+            // Without a condition a file is always put.
+            written.extend(put_file(&mut tx, survey, file, None).await?);
         }
+        tx.commit().await?;
+        Ok(written)
+    }
+
+    async fn replace_file(
+        &self,
+        survey: SurveyId,
+        file: &FileRecord,
+        wanted: &Wanted,
+    ) -> Result<Option<FileWritten>, StoreError> {
+        let mut tx = self.begin().await?;
+        let written = put_file(&mut tx, survey, file, Some(wanted)).await?;
         tx.commit().await?;
         Ok(written)
     }
@@ -261,12 +242,19 @@ impl Store for Rows {
         query.fetch_optional(&self.read).await?.as_ref().map(job).transpose()
     }
 
-    async fn jobs(&self, plant: PlantId, survey: Option<SurveyId>, page: Page) -> Result<Vec<Job>, StoreError> {
+    async fn jobs(
+        &self,
+        plant: PlantId,
+        survey: Option<SurveyId>,
+        state: Option<JobState>,
+        page: Page,
+    ) -> Result<Vec<Job>, StoreError> {
         let statement = if survey.is_some() { sql::JOBS_OF_SURVEY } else { sql::JOBS_OF_PLANT };
         let mut query = sqlx::query(statement)
             .bind(plant.to_string())
             .bind(page.after.unwrap_or(i64::MAX))
-            .bind(i64::from(page.limit));
+            .bind(i64::from(page.limit))
+            .bind(state.map(JobState::as_str));
         if let Some(survey) = survey {
             query = query.bind(survey.to_string());
         }
@@ -579,6 +567,59 @@ async fn sweep(tx: &mut Tx) -> Result<(), StoreError> {
         sqlx::query(statement).execute(&mut **tx).await?;
     }
     Ok(())
+}
+
+/// Puts a file where what is at its path is as wanted.
+async fn put_file(
+    tx: &mut Tx,
+    survey: SurveyId,
+    file: &FileRecord,
+    wanted: Option<&Wanted>,
+) -> Result<Option<FileWritten>, StoreError> {
+    let before: Option<String> = sqlx::query_scalar(sql::FILE_DIGEST)
+        .bind(survey.to_string())
+        .bind(file.path.as_str())
+        .fetch_optional(&mut **tx)
+        .await?;
+    if wanted.is_some_and(|wanted| !wanted.holds(before.as_deref().and_then(|digest| digest.parse().ok()))) {
+        return Ok(None);
+    }
+    let digest = file.sha256.to_string();
+    let verdict = match &before {
+        Some(before) if *before == digest => FileWritten::Unchanged,
+        Some(_) => FileWritten::Replaced,
+        None => FileWritten::Created,
+    };
+    let photo = file.photo.as_ref().map(|photo| serde_json::json!(photo).to_string());
+    let shots = file.shots.as_ref().map(|shots| serde_json::json!(shots).to_string());
+    if verdict == FileWritten::Unchanged {
+        sqlx::query(sql::COMPLETE_FILE)
+            .bind(survey.to_string())
+            .bind(file.path.as_str())
+            .bind(photo)
+            .bind(shots)
+            .execute(&mut **tx)
+            .await?;
+        return Ok(Some(verdict));
+    }
+    // What was looked at is what is replaced, whoever puts a file there meanwhile; no digest is empty.
+    let still = wanted.map(|_| before.unwrap_or_default());
+    let done = sqlx::query(sql::PUT_FILE)
+        .bind(survey.to_string())
+        .bind(file.path.as_str())
+        .bind(file.path.kind().as_str())
+        .bind(file.size as i64)
+        .bind(digest)
+        .bind(file.size_px.map(|size| i64::from(size[0])))
+        .bind(file.size_px.map(|size| i64::from(size[1])))
+        .bind(photo)
+        .bind(shots)
+        .bind(file.stored.as_millisecond())
+        .bind(still)
+        .execute(&mut **tx)
+        .await
+        .map_err(gone("survey"))?;
+    Ok((done.rows_affected() > 0).then_some(verdict))
 }
 
 async fn insert_feature(

@@ -70,6 +70,7 @@ pub fn audit_entry(row: &Row) -> Result<AuditEntry, StoreError> {
             Some((_, name)) => Some((KeyId(uuid(row, "key_id")?), name)),
             None => None,
         },
+        subject: row.try_get("subject")?,
         method: row.try_get("method")?,
         path: row.try_get("path")?,
         status: small("status", row.try_get("status")?)?,

@@ -1,0 +1,168 @@
+//! More of an upload comes, and is made safe step by step.
+
+use super::finish::finish;
+use super::protocol::{
+    Checksum, UPLOAD_EXPIRES, UPLOAD_OFFSET, answer, http_date, number, require_version, text, wrong,
+};
+use super::{LIFE, require_upload};
+use crate::http::AppState;
+use crate::http::error::{ApiError, Code, Problem};
+use crate::http::extract::ApiPath;
+use crate::http::intake::disk;
+use crate::plant::PlantId;
+use crate::store::{SurveyId, Upload, UploadId};
+use axum::body::{Body, BodyDataStream};
+use axum::extract::State;
+use axum::http::{HeaderMap, StatusCode};
+use axum::response::{IntoResponse, Response};
+use futures::StreamExt;
+use jiff::Timestamp;
+use std::io::SeekFrom;
+use std::path::Path;
+use tokio::io::{AsyncSeekExt, AsyncWriteExt, BufWriter};
+use tokio_util::sync::CancellationToken;
+
+/// After so many bytes what came is made safe.
+const STEP: u64 = 8 << 20;
+
+/// Send more of an upload (tus 1.0)
+///
+/// What came counts even where the line breaks; with `Upload-Checksum` (`sha1` or `sha256`) only as a whole. The answer to
+/// the last bytes tells whether the file was stored.
+#[utoipa::path(
+    patch,
+    path = "/api/v1/plants/{plant}/surveys/{survey}/uploads/{upload}",
+    tag = "surveys",
+    security(("key" = ["upload"])),
+    params(
+        ("plant" = Uuid, Path, description = "The plant's identifier"),
+        ("survey" = Uuid, Path, description = "The survey's identifier"),
+        ("upload" = Uuid, Path, description = "The upload's identifier"),
+        ("tus-resumable" = String, Header, pattern = "^1\\.0\\.0$", description = "`1.0.0`"),
+        ("upload-offset" = u64, Header, description = "Where these bytes begin"),
+        ("upload-checksum" = Option<String>, Header, description = "Algorithm and digest in base64")
+    ),
+    request_body(content = Vec<u8>, content_type = "application/offset+octet-stream", description = "The bytes"),
+    responses(
+        (status = 204, description = "Safe", headers(("upload-offset" = u64), ("upload-expires" = String))),
+        (status = 460, description = "`checksum_mismatch`: nothing of it counts", body = Problem,
+            content_type = "application/problem+json"),
+        (status = "4XX", description = "`plant_not_found`, `survey_not_found`, `upload_not_found`, `upload_offset`, \
+            `upload_busy`, `upload_interrupted`, `upload_stalled`, `tus_version`, `bad_request`, `too_large`, \
+            `unsupported_media_type`; after the last byte: as `PUT` of the file",
+            body = Problem, content_type = "application/problem+json"),
+        (status = 507, description = "`storage_full`, `quota_exceeded`", body = Problem, content_type = "application/problem+json")
+    )
+)]
+pub async fn patch(
+    State(state): State<AppState>,
+    ApiPath((plant, survey, id)): ApiPath<(PlantId, SurveyId, UploadId)>,
+    headers: HeaderMap,
+    body: Body,
+) -> Response {
+    answer(add(&state, plant, survey, id, &headers, body).await)
+}
+
+pub(super) async fn add(
+    state: &AppState,
+    plant: PlantId,
+    survey: SurveyId,
+    id: UploadId,
+    headers: &HeaderMap,
+    body: Body,
+) -> Result<Response, ApiError> {
+    state.require_survey(plant, survey).await?;
+    require_version(headers)?;
+    if text(headers, "content-type")? != Some("application/offset+octet-stream") {
+        let what = "send the bytes with the header `content-type: application/offset+octet-stream`";
+        return Err(ApiError::new(Code::UnsupportedMediaType, what));
+    }
+    let offset = number(headers, "upload-offset")?;
+    let checksum = text(headers, "upload-checksum")?.map(Checksum::parse).transpose()?;
+    let taken = state.desk.take(id).await?;
+    let mut upload = require_upload(state, survey, id).await?;
+    if offset != upload.received {
+        let what =
+            format!("{} bytes are safe, and these begin at {offset}: ask with HEAD where to go on", upload.received);
+        return Err(ApiError::new(Code::UploadOffset, what).with("offset", upload.received));
+    }
+    receive(state, &mut upload, body.into_data_stream(), checksum, &taken.interrupt).await?;
+    if upload.received == upload.length {
+        finish(state, plant, &upload).await?;
+    }
+    let headers = [(UPLOAD_OFFSET, upload.received.to_string()), (UPLOAD_EXPIRES, http_date(upload.expires))];
+    Ok((StatusCode::NO_CONTENT, headers).into_response())
+}
+
+/// Appends what comes to an upload's file, and says in `upload` how much of it is safe.
+async fn receive(
+    state: &AppState,
+    upload: &mut Upload,
+    mut body: BodyDataStream,
+    mut checksum: Option<Checksum>,
+    interrupt: &CancellationToken,
+) -> Result<(), ApiError> {
+    let path = state.blobs.upload_file(upload.id);
+    let io = |error| disk(&path, error);
+    let mut file = tokio::fs::OpenOptions::new().write(true).open(&path).await.map_err(io)?;
+    // What a crash left behind what is safe.
+    file.set_len(upload.received).await.map_err(io)?;
+    file.seek(SeekFrom::Start(upload.received)).await.map_err(io)?;
+    let mut file = BufWriter::with_capacity(256 << 10, file);
+    let mut at = upload.received;
+    let idle = state.limits.request_timeout;
+    let broken = loop {
+        let next = tokio::select! {
+            () = interrupt.cancelled() => {
+                break Some(ApiError::new(Code::UploadInterrupted, "a newer request goes on with this upload"));
+            }
+            next = tokio::time::timeout(idle, body.next()) => next,
+        };
+        let chunk = match next {
+            Ok(None) => break None,
+            Ok(Some(Ok(chunk))) => chunk,
+            Ok(Some(Err(_))) => {
+                break Some(ApiError::new(Code::UploadInterrupted, "the line broke; ask with HEAD where to go on"));
+            }
+            Err(_) => break Some(ApiError::new(Code::UploadStalled, "nothing came; ask with HEAD where to go on")),
+        };
+        if chunk.len() as u64 > upload.length - at {
+            break Some(wrong(format!("there is more than the {} bytes that were announced", upload.length)));
+        }
+        if let Some(checksum) = &mut checksum {
+            checksum.update(&chunk);
+        }
+        file.write_all(&chunk).await.map_err(io)?;
+        at += chunk.len() as u64;
+        if checksum.is_none() && at - upload.received >= STEP {
+            secure(state, upload, &mut file, at, &path).await?;
+        }
+    };
+    if let Some(checksum) = checksum {
+        let problem = broken.or_else(|| checksum.mismatch());
+        if let Some(problem) = problem {
+            return Err(problem);
+        }
+        return secure(state, upload, &mut file, at, &path).await;
+    }
+    secure(state, upload, &mut file, at, &path).await?;
+    broken.map_or(Ok(()), Err)
+}
+
+/// Makes safe what was written.
+async fn secure(
+    state: &AppState,
+    upload: &mut Upload,
+    file: &mut BufWriter<tokio::fs::File>,
+    at: u64,
+    path: &Path,
+) -> Result<(), ApiError> {
+    file.flush().await.map_err(|error| disk(path, error))?;
+    file.get_ref().sync_data().await.map_err(|error| disk(path, error))?;
+    upload.received = at;
+    upload.expires = Timestamp::now() + LIFE;
+    if !state.store.upload_received(upload.id, at, upload.expires).await? {
+        return Err(ApiError::new(Code::UploadNotFound, "the upload was ended meanwhile"));
+    }
+    Ok(())
+}

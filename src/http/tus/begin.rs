@@ -1,0 +1,146 @@
+//! Uploads begin, or are put together from their parts.
+
+use super::finish::{finish, remove};
+use super::place::Place;
+use super::protocol::{UPLOAD_EXPIRES, answer, http_date, number, require_version, text, wrong};
+use super::{LIFE, place, require_upload};
+use crate::http::AppState;
+use crate::http::error::{ApiError, Problem};
+use crate::http::extract::ApiPath;
+use crate::http::intake::{self, disk};
+use crate::plant::PlantId;
+use crate::store::{SurveyId, Upload, UploadId};
+use axum::extract::State;
+use axum::http::{HeaderMap, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use jiff::Timestamp;
+use uuid::Uuid;
+
+/// Longest metadata that is kept.
+const MAX_METADATA_BYTES: usize = 4096;
+
+/// Most parts of one file.
+const MAX_PARTS: usize = 1000;
+
+/// Begin an upload that may be resumed (tus 1.0)
+///
+/// `Upload-Length` says how large the file is, `Upload-Metadata` where it belongs: `filename` for a photo, or `path` in the
+/// survey's folder, or `path` of `reconstruction` for a zip or tar. With `Upload-Concat: partial` it is a part of a file,
+/// with `Upload-Concat: final;URL URL …` the file is put together from its parts.
+#[utoipa::path(
+    post,
+    path = "/api/v1/plants/{plant}/surveys/{survey}/uploads",
+    tag = "surveys",
+    security(("key" = ["upload"])),
+    params(
+        ("plant" = Uuid, Path, description = "The plant's identifier"),
+        ("survey" = Uuid, Path, description = "The survey's identifier"),
+        ("tus-resumable" = String, Header, pattern = "^1\\.0\\.0$", description = "`1.0.0`"),
+        ("upload-length" = Option<u64>, Header, description = "Bytes of the file"),
+        ("upload-metadata" = Option<String>, Header, description = "Names, each with its value in base64"),
+        ("upload-concat" = Option<String>, Header, description = "`partial`, or `final;` and the parts")
+    ),
+    responses(
+        (status = 201, description = "Send its bytes to `location`", headers(("location" = String),
+            ("upload-expires" = String))),
+        (status = "4XX", description = "`plant_not_found`, `survey_not_found`, `upload_not_found` (a part), `tus_version`, \
+            `bad_request`, `invalid_name`, `unknown_file`, `too_large`; a file put together: as `PUT` of that file",
+            body = Problem, content_type = "application/problem+json"),
+        (status = 507, description = "`storage_full`, `quota_exceeded`", body = Problem, content_type = "application/problem+json")
+    )
+)]
+pub async fn create(
+    State(state): State<AppState>,
+    ApiPath((plant, survey)): ApiPath<(PlantId, SurveyId)>,
+    headers: HeaderMap,
+) -> Response {
+    answer(create_upload(&state, plant, survey, &headers).await)
+}
+
+async fn create_upload(
+    state: &AppState,
+    plant: PlantId,
+    survey: SurveyId,
+    headers: &HeaderMap,
+) -> Result<Response, ApiError> {
+    state.require_survey(plant, survey).await?;
+    require_version(headers)?;
+    let metadata = text(headers, "upload-metadata")?.unwrap_or_default();
+    if metadata.len() > MAX_METADATA_BYTES {
+        return Err(wrong(format!("Upload-Metadata is longer than {MAX_METADATA_BYTES} bytes")));
+    }
+    let concat = text(headers, "upload-concat")?;
+    let partial = concat == Some("partial");
+    let parts = match concat.and_then(|concat| concat.strip_prefix("final;")) {
+        Some(urls) => Some(finished_parts(state, survey, urls).await?),
+        None if concat.is_none() || partial => None,
+        None => return Err(wrong("Upload-Concat must be `partial`, or `final;` and the URLs of the parts")),
+    };
+    let length = match &parts {
+        Some(parts) => parts.iter().map(|part| part.length).sum(),
+        None => number(headers, "upload-length")?,
+    };
+    let (name, limit) = match partial {
+        true => ("the part".to_owned(), state.limits.max_archive_size.max(state.limits.max_file_size)),
+        false => {
+            let place = Place::of(metadata)?;
+            (place.name().to_owned(), place.max_bytes(state))
+        }
+    };
+    if length > limit {
+        return Err(intake::too_large(&name, limit));
+    }
+    let id = UploadId(Uuid::new_v4());
+    let file = state.blobs.upload_file(id);
+    let sources: Vec<_> = parts.iter().flatten().map(|part| state.blobs.upload_file(part.id)).collect();
+    let target = file.clone();
+    let put_together = tokio::task::spawn_blocking(move || {
+        let mut whole = std::fs::File::create_new(&target)?;
+        for source in sources {
+            std::io::copy(&mut std::fs::File::open(source)?, &mut whole)?;
+        }
+        whole.sync_all()
+    });
+    put_together.await.map_err(|error| ApiError::internal(&error))?.map_err(|error| disk(&file, error))?;
+    let upload = Upload {
+        id,
+        survey,
+        length,
+        received: if parts.is_some() { length } else { 0 },
+        partial,
+        metadata: metadata.to_owned(),
+        expires: Timestamp::now() + LIFE,
+        outcome: None,
+    };
+    state.store.create_upload(&upload).await?;
+    if upload.received == length {
+        finish(state, plant, &upload).await?;
+    }
+    for part in parts.iter().flatten() {
+        state.store.delete_upload(survey, part.id).await?;
+        remove(&state.blobs.upload_file(part.id)).await;
+    }
+    let headers = [(header::LOCATION, place(plant, survey, id)), (UPLOAD_EXPIRES, http_date(upload.expires))];
+    Ok((StatusCode::CREATED, headers).into_response())
+}
+
+/// The parts of a file, all of which must be whole.
+async fn finished_parts(state: &AppState, survey: SurveyId, urls: &str) -> Result<Vec<Upload>, ApiError> {
+    let mut parts = Vec::new();
+    for url in urls.split_ascii_whitespace() {
+        let id = url.rsplit('/').next().and_then(|id| Uuid::try_parse(id).ok()).map(UploadId);
+        let part =
+            require_upload(state, survey, id.ok_or_else(|| wrong(format!("`{url}` is no upload's URL")))?).await?;
+        if !part.partial || part.received < part.length {
+            return Err(wrong(format!("{url} is no part that is whole")));
+        }
+        parts.push(part);
+        if parts.len() > MAX_PARTS {
+            return Err(wrong(format!("a file may have {MAX_PARTS} parts at the most")));
+        }
+    }
+    if parts.is_empty() {
+        return Err(wrong("Upload-Concat names no parts"));
+    }
+    Ok(parts)
+}

@@ -1,0 +1,273 @@
+//! Resumable uploads by the tus protocol 1.0 (<https://tus.io/protocols/resumable-upload>) with creation, expiration,
+//! checksum, termination and concatenation.
+//!
+//! It is spoken here and not by a library, because those that there are count the bytes of a request only once all have
+//! come: over a line that breaks every minute a large file would never get through. Here every eight megabytes are made
+//! safe, and whatever came before a line broke counts.
+
+pub mod append;
+pub mod begin;
+
+mod desk;
+mod finish;
+mod place;
+mod protocol;
+
+pub use desk::Desk;
+
+use super::AppState;
+use super::error::{ApiError, Code, Problem};
+use super::extract::ApiPath;
+use super::uploads::UploadedFile;
+use crate::plant::PlantId;
+use crate::store::{SurveyId, Upload, UploadId};
+use axum::Json;
+use axum::body::Body;
+use axum::extract::State;
+use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use finish::{finish, remove};
+use jiff::{SignedDuration, Timestamp};
+use protocol::{ALGORITHMS, EXTENSIONS, UPLOAD_EXPIRES, UPLOAD_OFFSET, VERSION, answer, http_date, require_version};
+use serde::Serialize;
+
+/// How long an upload lives after its last byte.
+const LIFE: SignedDuration = SignedDuration::from_hours(24);
+
+/// How an upload stands.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub struct UploadView {
+    #[schema(value_type = Uuid)]
+    pub id: UploadId,
+    /// Bytes of the whole file.
+    pub length: u64,
+    /// Bytes that are safe.
+    pub offset: u64,
+    /// When it is forgotten, unless more comes.
+    #[schema(value_type = String, format = DateTime)]
+    pub expires: Timestamp,
+    /// What became of the whole file.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub outcome: Option<Outcome>,
+}
+
+/// What became of a whole file: stored, or refused.
+#[derive(Debug, Serialize, serde::Deserialize, utoipa::ToSchema)]
+pub struct Outcome {
+    /// The files that it was, one but for an archive.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[schema(value_type = Vec<UploadedFile>)]
+    pub files: Vec<serde_json::Value>,
+    /// Why it was refused, a problem document.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<Problem>)]
+    pub problem: Option<serde_json::Value>,
+}
+
+fn place(plant: PlantId, survey: SurveyId, id: UploadId) -> String {
+    format!("/api/v1/plants/{plant}/surveys/{survey}/uploads/{id}")
+}
+
+async fn require_upload(state: &AppState, survey: SurveyId, id: UploadId) -> Result<Upload, ApiError> {
+    let found = state.store.upload(survey, id).await?.filter(|upload| upload.expires > Timestamp::now());
+    found.ok_or_else(|| {
+        ApiError::new(
+            Code::UploadNotFound,
+            format!("no upload to this survey has the identifier {id}; begin a new one"),
+        )
+    })
+}
+
+/// What this service speaks of the tus protocol
+#[utoipa::path(
+    options,
+    path = "/api/v1/plants/{plant}/surveys/{survey}/uploads",
+    tag = "surveys",
+    security(()),
+    params(
+        ("plant" = Uuid, Path, description = "The plant's identifier"),
+        ("survey" = Uuid, Path, description = "The survey's identifier")
+    ),
+    responses(
+        (status = 204, description = "See the headers", headers(("tus-version" = String), ("tus-extension" = String),
+            ("tus-max-size" = u64), ("tus-checksum-algorithm" = String))),
+        (status = 404, description = "`not_found`: identifiers are UUIDs", body = Problem,
+            content_type = "application/problem+json")
+    )
+)]
+pub async fn options(State(state): State<AppState>, _place: ApiPath<(PlantId, SurveyId)>) -> Response {
+    let largest = state.limits.max_archive_size.max(state.limits.max_file_size).to_string();
+    let headers = [
+        ("tus-version", VERSION),
+        ("tus-extension", EXTENSIONS),
+        ("tus-max-size", largest.as_str()),
+        ("tus-checksum-algorithm", ALGORITHMS),
+    ];
+    answer(Ok((StatusCode::NO_CONTENT, headers).into_response()))
+}
+
+/// How far an upload is (tus 1.0)
+#[utoipa::path(
+    head,
+    path = "/api/v1/plants/{plant}/surveys/{survey}/uploads/{upload}",
+    tag = "surveys",
+    security(("key" = ["upload"])),
+    params(
+        ("plant" = Uuid, Path, description = "The plant's identifier"),
+        ("survey" = Uuid, Path, description = "The survey's identifier"),
+        ("upload" = Uuid, Path, description = "The upload's identifier"),
+        ("tus-resumable" = String, Header, pattern = "^1\\.0\\.0$", description = "`1.0.0`")
+    ),
+    responses(
+        (status = 200, description = "Go on at `upload-offset`", headers(("upload-offset" = u64), ("upload-length" = u64),
+            ("upload-expires" = String))),
+        (status = "4XX", description = "`plant_not_found`, `survey_not_found`, `upload_not_found`, `upload_busy`, \
+            `tus_version`")
+    )
+)]
+pub async fn head(
+    State(state): State<AppState>,
+    ApiPath((plant, survey, id)): ApiPath<(PlantId, SurveyId, UploadId)>,
+    headers: HeaderMap,
+) -> Response {
+    answer(tell(&state, plant, survey, id, &headers).await)
+}
+
+async fn tell(
+    state: &AppState,
+    plant: PlantId,
+    survey: SurveyId,
+    id: UploadId,
+    headers: &HeaderMap,
+) -> Result<Response, ApiError> {
+    state.require_survey(plant, survey).await?;
+    require_version(headers)?;
+    let _taken = state.desk.take(id).await?;
+    let upload = require_upload(state, survey, id).await?;
+    if upload.received == upload.length {
+        finish(state, plant, &upload).await?;
+    }
+    let mut answer = HeaderMap::new();
+    answer.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
+    answer.insert(UPLOAD_OFFSET, upload.received.into());
+    answer.insert("upload-length", upload.length.into());
+    if let Ok(metadata) = HeaderValue::from_str(&upload.metadata)
+        && !upload.metadata.is_empty()
+    {
+        answer.insert("upload-metadata", metadata);
+    }
+    if upload.partial {
+        answer.insert("upload-concat", HeaderValue::from_static("partial"));
+    }
+    let expires = HeaderValue::from_str(&http_date(upload.expires)).map_err(|error| ApiError::internal(&error))?;
+    answer.insert(UPLOAD_EXPIRES, expires);
+    Ok((StatusCode::OK, answer).into_response())
+}
+
+/// How an upload stands, and what became of the whole file
+#[utoipa::path(
+    get,
+    path = "/api/v1/plants/{plant}/surveys/{survey}/uploads/{upload}",
+    tag = "surveys",
+    security(("key" = ["read"]), ("key" = ["review"]), ("key" = ["upload"])),
+    params(
+        ("plant" = Uuid, Path, description = "The plant's identifier"),
+        ("survey" = Uuid, Path, description = "The survey's identifier"),
+        ("upload" = Uuid, Path, description = "The upload's identifier")
+    ),
+    responses(
+        (status = 200, body = UploadView),
+        (status = 404, description = "`plant_not_found`, `survey_not_found`, `upload_not_found`", body = Problem,
+            content_type = "application/problem+json")
+    )
+)]
+pub async fn get(
+    State(state): State<AppState>,
+    ApiPath((plant, survey, id)): ApiPath<(PlantId, SurveyId, UploadId)>,
+) -> Result<Json<UploadView>, ApiError> {
+    state.require_survey(plant, survey).await?;
+    let upload = require_upload(&state, survey, id).await?;
+    let outcome = upload.outcome.as_deref().map(serde_json::from_str).transpose();
+    Ok(Json(UploadView {
+        id,
+        length: upload.length,
+        offset: upload.received,
+        expires: upload.expires,
+        outcome: outcome.map_err(|error| ApiError::internal(&error))?,
+    }))
+}
+
+/// End an upload and forget it (tus 1.0)
+#[utoipa::path(
+    delete,
+    path = "/api/v1/plants/{plant}/surveys/{survey}/uploads/{upload}",
+    tag = "surveys",
+    security(("key" = ["upload"])),
+    params(
+        ("plant" = Uuid, Path, description = "The plant's identifier"),
+        ("survey" = Uuid, Path, description = "The survey's identifier"),
+        ("upload" = Uuid, Path, description = "The upload's identifier"),
+        ("tus-resumable" = String, Header, pattern = "^1\\.0\\.0$", description = "`1.0.0`")
+    ),
+    responses(
+        (status = 204, description = "Gone; a file that was stored stays"),
+        (status = "4XX", description = "`plant_not_found`, `survey_not_found`, `upload_not_found`, `upload_busy`, \
+            `tus_version`", body = Problem, content_type = "application/problem+json")
+    )
+)]
+pub async fn terminate(
+    State(state): State<AppState>,
+    ApiPath((plant, survey, id)): ApiPath<(PlantId, SurveyId, UploadId)>,
+    headers: HeaderMap,
+) -> Response {
+    answer(end(&state, plant, survey, id, &headers).await)
+}
+
+async fn end(
+    state: &AppState,
+    plant: PlantId,
+    survey: SurveyId,
+    id: UploadId,
+    headers: &HeaderMap,
+) -> Result<Response, ApiError> {
+    state.require_survey(plant, survey).await?;
+    require_version(headers)?;
+    let _taken = state.desk.take(id).await?;
+    require_upload(state, survey, id).await?;
+    state.store.delete_upload(survey, id).await?;
+    remove(&state.blobs.upload_file(id)).await;
+    Ok(StatusCode::NO_CONTENT.into_response())
+}
+
+/// As `PATCH` or `DELETE`, for clients that cannot send these: the header `X-HTTP-Method-Override` tells which
+#[utoipa::path(
+    post,
+    path = "/api/v1/plants/{plant}/surveys/{survey}/uploads/{upload}",
+    tag = "surveys",
+    security(("key" = ["upload"])),
+    params(
+        ("plant" = Uuid, Path, description = "The plant's identifier"),
+        ("survey" = Uuid, Path, description = "The survey's identifier"),
+        ("upload" = Uuid, Path, description = "The upload's identifier"),
+        ("x-http-method-override" = String, Header, pattern = "^(PATCH|DELETE)$", description = "`PATCH` or `DELETE`")
+    ),
+    request_body(content = Vec<u8>, content_type = "application/offset+octet-stream", description = "The bytes"),
+    responses(
+        (status = 204, description = "As the method that it stands for"),
+        (status = "4XX", description = "As the method that it stands for", body = Problem,
+            content_type = "application/problem+json")
+    )
+)]
+pub async fn post(
+    State(state): State<AppState>,
+    ApiPath((plant, survey, id)): ApiPath<(PlantId, SurveyId, UploadId)>,
+    headers: HeaderMap,
+    body: Body,
+) -> Response {
+    let method = headers.get("x-http-method-override").and_then(|value| Method::from_bytes(value.as_bytes()).ok());
+    answer(match method {
+        Some(Method::PATCH) => append::add(&state, plant, survey, id, &headers, body).await,
+        Some(Method::DELETE) => end(&state, plant, survey, id, &headers).await,
+        _ => Err(ApiError::new(Code::MethodNotAllowed, "send PATCH, or the header `X-HTTP-Method-Override: PATCH`")),
+    })
+}

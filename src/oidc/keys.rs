@@ -1,0 +1,204 @@
+//! The provider's public keys: found by its discovery document, kept, and fetched again when a token names one that is not
+//! known, within bounds, since anyone may send such a token.
+
+use jsonwebtoken::jwk::{AlgorithmParameters, EllipticCurve, Jwk, PublicKeyUse};
+use jsonwebtoken::{Algorithm, DecodingKey};
+use reqwest::{Client, Url, redirect};
+use serde::Deserialize;
+use serde_json::Value;
+use std::sync::{Arc, PoisonError, RwLock};
+use std::time::{Duration, Instant};
+use tokio::sync::Mutex;
+
+/// How long keys are kept without asking whether they still hold.
+const MAX_AGE: Duration = Duration::from_secs(3600);
+/// How long a fetch may take.
+const TIMEOUT: Duration = Duration::from_secs(5);
+/// Largest answer of the provider, bytes.
+const MAX_BYTES: usize = 256 << 10;
+/// Most keys that are kept.
+const MAX_KEYS: usize = 100;
+
+/// Why there are no keys.
+#[derive(Debug, Clone, thiserror::Error)]
+pub enum KeyError {
+    #[error("{url} is no URL to fetch keys from: it must begin with https://, or name this machine")]
+    Url { url: String },
+    #[error("no requests can be sent: {0}; install the certificates of public authorities")]
+    Client(String),
+    #[error("{url}: {what}")]
+    Fetch { url: String, what: String },
+}
+
+/// A public key of the provider.
+#[derive(Debug, Clone)]
+struct Known {
+    id: Option<String>,
+    algorithm: Algorithm,
+    key: DecodingKey,
+}
+
+#[derive(Debug, Default)]
+struct Kept {
+    keys: Vec<Known>,
+    /// When they were fetched.
+    fetched: Option<Instant>,
+    /// When a fetch was last tried.
+    tried: Option<Instant>,
+    /// Why the last fetch failed, where it did.
+    failure: Option<KeyError>,
+}
+
+/// The provider's keys.
+#[derive(Debug)]
+pub struct Keys {
+    issuer: String,
+    discovery: Url,
+    client: Client,
+    min_refresh: Duration,
+    /// Held by whoever fetches.
+    turn: Mutex<()>,
+    kept: RwLock<Arc<Kept>>,
+}
+
+impl Kept {
+    fn is_fresh(&self) -> bool {
+        self.fetched.is_some_and(|fetched| fetched.elapsed() < MAX_AGE)
+    }
+}
+
+/// What the discovery document tells (OpenID Connect Discovery 1.0, section 3).
+#[derive(Deserialize)]
+struct Discovery {
+    issuer: String,
+    jwks_uri: String,
+}
+
+#[derive(Deserialize)]
+struct KeySet {
+    keys: Vec<Value>,
+}
+
+impl Keys {
+    /// The keys of an issuer, which is not asked yet.
+    pub fn new(issuer: &str, min_refresh: Duration) -> Result<Self, KeyError> {
+        let discovery = checked(&format!("{}/.well-known/openid-configuration", issuer.trim_end_matches('/')))?;
+        crate::tls::provide();
+        let client = Client::builder().timeout(TIMEOUT).redirect(redirect::Policy::none()).build();
+        let client = client.map_err(|error| KeyError::Client(error.to_string()))?;
+        let (turn, kept) = (Mutex::default(), RwLock::default());
+        Ok(Self { issuer: issuer.to_owned(), discovery, client, min_refresh, turn, kept })
+    }
+
+    /// The key of this identifier for this algorithm; without an identifier, the only one for the algorithm.
+    pub async fn key(&self, id: Option<&str>, algorithm: Algorithm) -> Result<Option<DecodingKey>, KeyError> {
+        let known = self.kept();
+        if let Some(key) = pick(&known.keys, id, algorithm).filter(|_| known.is_fresh()) {
+            return Ok(Some(key));
+        }
+        // Whoever comes while keys are being fetched waits for them.
+        let _turn = self.turn.lock().await;
+        let known = self.kept();
+        let found = pick(&known.keys, id, algorithm);
+        let soon = known.tried.is_some_and(|tried| tried.elapsed() < self.min_refresh);
+        if soon || (found.is_some() && known.is_fresh()) {
+            return match (&known.failure, known.keys.is_empty()) {
+                (Some(failure), true) => Err(failure.clone()),
+                _ => Ok(found),
+            };
+        }
+        match self.refresh().await {
+            Ok(_) => Ok(pick(&self.kept().keys, id, algorithm)),
+            // Those that are there go on to hold.
+            Err(error) if known.keys.is_empty() => Err(error),
+            Err(_) => Ok(found),
+        }
+    }
+
+    fn kept(&self) -> Arc<Kept> {
+        self.kept.read().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Fetches the keys; how many there are.
+    pub async fn refresh(&self) -> Result<usize, KeyError> {
+        let (before, tried) = (self.kept(), Some(Instant::now()));
+        let fetched = self.fetch().await;
+        let kept = match &fetched {
+            Ok(keys) => {
+                tracing::info!(issuer = self.issuer, count = keys.len(), "fetched the identity provider's keys");
+                Kept { keys: keys.clone(), fetched: Some(Instant::now()), tried, failure: None }
+            }
+            Err(error) => {
+                tracing::warn!(%error, "cannot fetch the identity provider's keys");
+                Kept { keys: before.keys.clone(), fetched: before.fetched, tried, failure: Some(error.clone()) }
+            }
+        };
+        *self.kept.write().unwrap_or_else(PoisonError::into_inner) = Arc::new(kept);
+        fetched.map(|keys| keys.len())
+    }
+
+    async fn fetch(&self) -> Result<Vec<Known>, KeyError> {
+        let discovery: Discovery = self.get(self.discovery.clone()).await?;
+        if discovery.issuer != self.issuer {
+            let what = format!("it is of the issuer `{}` and not of `{}`", discovery.issuer, self.issuer);
+            return Err(KeyError::Fetch { url: self.discovery.to_string(), what });
+        }
+        let set: KeySet = self.get(checked(&discovery.jwks_uri)?).await?;
+        // What is for something else, or unknown here, is passed over.
+        let keys = set.keys.into_iter().take(MAX_KEYS).filter_map(|key| known(serde_json::from_value(key).ok()?));
+        Ok(keys.collect())
+    }
+
+    /// A JSON document.
+    async fn get<T: serde::de::DeserializeOwned>(&self, url: Url) -> Result<T, KeyError> {
+        let failed = |what: String| KeyError::Fetch { url: url.to_string(), what };
+        let told = |error: reqwest::Error| failed(error.without_url().to_string());
+        let mut answer = self.client.get(url.clone()).send().await.map_err(told)?;
+        if !answer.status().is_success() {
+            return Err(failed(format!("it answered {}", answer.status())));
+        }
+        let mut body = Vec::new();
+        while let Some(chunk) = answer.chunk().await.map_err(told)? {
+            body.extend_from_slice(&chunk);
+            if body.len() > MAX_BYTES {
+                return Err(failed(format!("it answered more than {MAX_BYTES} bytes")));
+            }
+        }
+        serde_json::from_slice(&body).map_err(|error| failed(format!("its answer cannot be read: {error}")))
+    }
+}
+
+/// A URL that keys may be fetched from: nobody in between may change them.
+fn checked(text: &str) -> Result<Url, KeyError> {
+    let url = Url::parse(text).map_err(|_| KeyError::Url { url: text.to_owned() })?;
+    let here = matches!(url.host_str(), Some("127.0.0.1" | "[::1]" | "localhost"));
+    match url.scheme() {
+        "https" => Ok(url),
+        "http" if here => Ok(url),
+        _ => Err(KeyError::Url { url: text.to_owned() }),
+    }
+}
+
+/// A key that signs tokens by one of the algorithms that are taken.
+fn known(jwk: Jwk) -> Option<Known> {
+    let algorithm = match &jwk.algorithm {
+        AlgorithmParameters::RSA(_) => Algorithm::RS256,
+        AlgorithmParameters::EllipticCurve(curve) if curve.curve == EllipticCurve::P256 => Algorithm::ES256,
+        AlgorithmParameters::OctetKeyPair(pair) if pair.curve == EllipticCurve::Ed25519 => Algorithm::EdDSA,
+        _ => return None,
+    };
+    let signs = jwk.common.public_key_use.as_ref().is_none_or(|usage| *usage == PublicKeyUse::Signature);
+    let said = jwk.common.key_algorithm.map(|said| said.to_string());
+    let fits = said.is_none_or(|said| said == format!("{algorithm:?}"));
+    let key = DecodingKey::from_jwk(&jwk).ok()?;
+    (signs && fits).then_some(Known { id: jwk.common.key_id, algorithm, key })
+}
+
+fn pick(keys: &[Known], id: Option<&str>, algorithm: Algorithm) -> Option<DecodingKey> {
+    let mut fitting =
+        keys.iter().filter(|known| known.algorithm == algorithm && (id.is_none() || known.id.as_deref() == id));
+    match (fitting.next(), fitting.next()) {
+        (Some(known), None) => Some(known.key.clone()),
+        _ => None,
+    }
+}
