@@ -2,14 +2,19 @@
 
 pub mod file;
 
+mod access;
+mod identity;
+mod limits;
+
+pub use access::{KeysArgs, KeysCommand, OrganisationsArgs, OrganisationsCommand, Quota};
+pub use identity::OidcArgs;
+pub use limits::Limits;
+
 use crate::detection::{self, DetectionError, Detector, ExecutionProvider, RuntimeSettings};
-use crate::oidc::{OidcSettings, OrganisationRule};
-use crate::plant::PlantId;
-use crate::store::usage::{Quotas, UNLIMITED};
-use crate::store::{Bucket, KeyId, Scope};
+use crate::store::Bucket;
 use crate::webhooks::Targets;
 use axum::http::HeaderValue;
-use clap::{Args, Subcommand, ValueEnum};
+use clap::{Args, ValueEnum};
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::Duration;
@@ -105,66 +110,6 @@ impl WebhookArgs {
     }
 }
 
-/// Whose tokens let in beside keys.
-#[derive(Debug, Clone, Default, Args)]
-#[command(next_help_heading = "Identity provider")]
-pub struct OidcArgs {
-    /// An OpenID Connect provider whose tokens (RS256, ES256 or EdDSA) let in beside keys, by its `issuer`, to the letter.
-    #[arg(long, env = "HELIOMAP_OIDC_ISSUER", value_name = "URL")]
-    pub oidc_issuer: Option<String>,
-    /// What must stand in a token's `aud`.
-    #[arg(long, env = "HELIOMAP_OIDC_AUDIENCE", value_name = "NAME")]
-    pub oidc_audience: Option<String>,
-    /// The claim that names the caller's organisation; dots lead into claims within claims.
-    #[arg(long, env = "HELIOMAP_OIDC_ORGANISATION_CLAIM", default_value = "organisation", value_name = "CLAIM")]
-    pub oidc_organisation_claim: String,
-    /// The organisation of all callers, whatever their tokens say.
-    #[arg(long, env = "HELIOMAP_OIDC_ORGANISATION", value_name = "NAME")]
-    pub oidc_organisation: Option<String>,
-    /// The claim that says what a caller may do: words with blanks between them, or a list.
-    #[arg(long, env = "HELIOMAP_OIDC_SCOPE_CLAIM", default_value = "scope", value_name = "CLAIM")]
-    pub oidc_scope_claim: String,
-    /// What a word of that claim stands for, `plant-admins=admin`; may be given more than once.
-    #[arg(long, env = "HELIOMAP_OIDC_SCOPE", value_delimiter = ',', value_parser = parse_scope_word, value_name = "WORD=SCOPE",
-        default_value = "heliomap:upload=upload,heliomap:read=read,heliomap:review=review,heliomap:admin=admin")]
-    pub oidc_scope: Vec<(String, Scope)>,
-}
-
-/// The least time between two fetches of a provider's keys.
-const MIN_KEY_REFRESH: Duration = Duration::from_secs(10);
-
-impl OidcArgs {
-    /// What tokens are checked by; `None` where no provider is named.
-    ///
-    /// # Errors
-    /// Where it is not said for whom its tokens must be.
-    pub fn settings(&self) -> Result<Option<OidcSettings>, &'static str> {
-        let Some(issuer) = self.oidc_issuer.clone() else { return Ok(None) };
-        let audience =
-            self.oidc_audience.clone().ok_or("--oidc-issuer needs --oidc-audience: what stands in a token's `aud`")?;
-        let organisation = match &self.oidc_organisation {
-            Some(name) => OrganisationRule::Named(name.clone()),
-            None => OrganisationRule::Claim(self.oidc_organisation_claim.clone()),
-        };
-        Ok(Some(OidcSettings {
-            issuer,
-            audience,
-            organisation,
-            scope_claim: self.oidc_scope_claim.clone(),
-            scopes: self.oidc_scope.clone(),
-            min_refresh: MIN_KEY_REFRESH,
-        }))
-    }
-}
-
-fn parse_scope_word(text: &str) -> Result<(String, Scope), String> {
-    let parsed = text.rsplit_once('=').and_then(|(word, scope)| Some((word.to_owned(), scope.parse().ok()?)));
-    parsed.filter(|(word, _)| !word.is_empty()).ok_or_else(|| {
-        "a word and what it stands for are expected, one of upload, read, review and admin: plant-admins=admin"
-            .to_owned()
-    })
-}
-
 /// Where the process tells what it counts.
 #[derive(Debug, Clone, Default, Args)]
 pub struct MetricsArgs {
@@ -205,105 +150,6 @@ pub struct DoctorArgs {
     /// Print JSON: a list of checks, each with `name`, `verdict` (`ok`, `warning` or `failed`), `found` and `advice`.
     #[arg(long)]
     pub json: bool,
-}
-
-/// `heliomap keys`.
-#[derive(Debug, Clone, Args)]
-pub struct KeysArgs {
-    #[command(flatten)]
-    pub storage: StorageArgs,
-    #[command(subcommand)]
-    pub command: KeysCommand,
-}
-
-/// What is done about keys.
-#[derive(Debug, Clone, Subcommand)]
-pub enum KeysCommand {
-    /// Make a key and print its secret, which is kept nowhere.
-    Create {
-        /// What people call it.
-        #[arg(long, value_name = "NAME")]
-        name: String,
-        /// What it is good for; may be given more than once.
-        #[arg(long, value_enum, value_name = "SCOPE", required = true)]
-        scope: Vec<Scope>,
-        /// The organisation that it belongs to, by name; made where there is none.
-        #[arg(long, value_name = "NAME", default_value = "default")]
-        organisation: String,
-        /// A plant that it is good for; may be given more than once; all plants where it is not given.
-        #[arg(long, value_name = "UUID")]
-        plant: Vec<PlantId>,
-        /// Days after which it ends; never where it is not given.
-        #[arg(long, value_name = "N")]
-        days: Option<u32>,
-    },
-    /// List all keys.
-    List,
-    /// Make a key good for nothing, for ever.
-    Revoke {
-        /// The key's identifier.
-        #[arg(value_parser = parse_key_id, value_name = "UUID")]
-        id: KeyId,
-    },
-    /// Give a key a new secret and print it.
-    Rotate {
-        /// The key's identifier.
-        #[arg(value_parser = parse_key_id, value_name = "UUID")]
-        id: KeyId,
-        /// Hours for which the secret so far stays good.
-        #[arg(long, value_name = "N", default_value_t = 0)]
-        grace_hours: u32,
-    },
-}
-
-fn parse_key_id(text: &str) -> Result<KeyId, uuid::Error> {
-    text.parse().map(KeyId)
-}
-
-/// `heliomap organisations`.
-#[derive(Debug, Clone, Args)]
-pub struct OrganisationsArgs {
-    #[command(flatten)]
-    pub storage: StorageArgs,
-    #[command(subcommand)]
-    pub command: OrganisationsCommand,
-}
-
-/// What is done about organisations.
-#[derive(Debug, Clone, Subcommand)]
-pub enum OrganisationsCommand {
-    /// List all organisations with what they keep and may keep.
-    List,
-    /// Make an organisation, or find the one of that name.
-    Create {
-        /// The organisation's name.
-        #[arg(value_name = "NAME")]
-        name: String,
-    },
-    /// Say what an organisation may keep; what is not given stays as it is.
-    Quota {
-        /// The organisation's name.
-        #[arg(value_name = "NAME")]
-        name: String,
-        /// Bytes of files and models: a size such as 500G, `unlimited`, or `default` for what `--quota-bytes` says.
-        #[arg(long, value_name = "SIZE", value_parser = parse_quota)]
-        bytes: Option<Quota>,
-        /// Plants: a number, `unlimited`, or `default` for what `--quota-plants` says.
-        #[arg(long, value_name = "COUNT", value_parser = parse_quota)]
-        plants: Option<Quota>,
-    },
-}
-
-/// A quota of an organisation; `None` for what holds for all.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Quota(pub Option<u64>);
-
-fn parse_quota(text: &str) -> Result<Quota, String> {
-    match text {
-        "default" => Ok(Quota(None)),
-        "unlimited" => Ok(Quota(Some(UNLIMITED))),
-        text => parse_size(text).map(|size| Quota(Some(size))),
-    }
 }
 
 /// `heliomap backup`.
@@ -390,102 +236,6 @@ impl DetectorArgs {
     }
 }
 
-/// How much one client may ask for. Sizes take the endings K, M, G and T (powers of 1024).
-#[derive(Debug, Clone, Args)]
-#[command(next_help_heading = "Limits")]
-pub struct Limits {
-    /// Largest image file.
-    #[arg(long, env = "HELIOMAP_MAX_IMAGE_SIZE", default_value = "256M", value_parser = parse_size, value_name = "SIZE")]
-    pub max_image_size: u64,
-    /// Largest image, in millions of pixels; checked before an image is decoded.
-    #[arg(long, env = "HELIOMAP_MAX_IMAGE_MEGAPIXELS", default_value_t = 100.0, value_name = "MP")]
-    pub max_image_megapixels: f64,
-    /// Largest single file of a reconstruction.
-    #[arg(long, env = "HELIOMAP_MAX_FILE_SIZE", default_value = "8G", value_parser = parse_size, value_name = "SIZE")]
-    pub max_file_size: u64,
-    /// Largest zip or tar.
-    #[arg(long, env = "HELIOMAP_MAX_ARCHIVE_SIZE", default_value = "16G", value_parser = parse_size, value_name = "SIZE")]
-    pub max_archive_size: u64,
-    /// Largest sum of the files in a zip or tar.
-    #[arg(long, env = "HELIOMAP_MAX_UNPACKED_SIZE", default_value = "64G", value_parser = parse_size, value_name = "SIZE")]
-    pub max_unpacked_size: u64,
-    /// How many times as large as the zip or tar its files may be, from 64 MiB on.
-    #[arg(long, env = "HELIOMAP_MAX_UNPACKED_RATIO", default_value_t = 50, value_name = "TIMES")]
-    pub max_unpacked_ratio: u64,
-    /// Most entries in a zip or tar, and most images in one multipart upload.
-    #[arg(long, env = "HELIOMAP_MAX_ENTRIES", default_value_t = 20_000, value_name = "COUNT")]
-    pub max_entries: usize,
-    /// How often a job is started without getting anywhere before it fails.
-    #[arg(long, env = "HELIOMAP_MAX_ATTEMPTS", default_value_t = 3, value_name = "COUNT")]
-    pub max_attempts: u32,
-    /// How long an upload may stand still, and any other request may take, in seconds.
-    #[arg(long, env = "HELIOMAP_REQUEST_TIMEOUT", default_value = "30", value_parser = parse_seconds, value_name = "SECONDS")]
-    pub request_timeout: Duration,
-    /// Requests per second of one key, on average; for a moment twice as many.
-    #[arg(long, env = "HELIOMAP_MAX_REQUESTS_PER_SECOND", default_value_t = 300, value_parser = clap::value_parser!(u32).range(1..), value_name = "COUNT")]
-    pub max_requests_per_second: u32,
-    /// Requests per minute without a good key from one address before it is told to wait.
-    #[arg(long, env = "HELIOMAP_MAX_FAILED_LOGINS_PER_MINUTE", default_value_t = 300, value_parser = clap::value_parser!(u32).range(1..), value_name = "COUNT")]
-    pub max_failed_logins_per_minute: u32,
-    /// Most connections at once; more wait.
-    #[arg(long, env = "HELIOMAP_MAX_CONNECTIONS", default_value_t = 1024, value_name = "COUNT")]
-    pub max_connections: usize,
-    /// Free space of the data folder's disk that uploads leave to running jobs.
-    #[arg(long, env = "HELIOMAP_DISK_RESERVE", default_value = "1G", value_parser = parse_size, value_name = "SIZE")]
-    pub disk_reserve: u64,
-    /// Most bytes of files and models that an organisation may keep, unless `heliomap organisations quota` says otherwise of
-    /// it; no bound where it is not given.
-    #[arg(long, env = "HELIOMAP_QUOTA_BYTES", value_parser = parse_size, value_name = "SIZE")]
-    pub quota_bytes: Option<u64>,
-    /// Most plants that an organisation may have, unless `heliomap organisations quota` says otherwise of it; no bound where it
-    /// is not given.
-    #[arg(long, env = "HELIOMAP_QUOTA_PLANTS", value_name = "COUNT")]
-    pub quota_plants: Option<u64>,
-}
-
-impl Limits {
-    /// What every organisation may keep of which nothing else was said.
-    pub fn quotas(&self) -> Quotas {
-        Quotas { bytes: self.quota_bytes, plants: self.quota_plants }
-    }
-}
-
-impl Default for Limits {
-    fn default() -> Self {
-        Self {
-            max_image_size: 256 << 20,
-            max_image_megapixels: 100.0,
-            max_file_size: 8 << 30,
-            max_archive_size: 16 << 30,
-            max_unpacked_size: 64 << 30,
-            max_unpacked_ratio: 50,
-            max_entries: 20_000,
-            max_attempts: 3,
-            request_timeout: Duration::from_secs(30),
-            max_requests_per_second: 300,
-            max_failed_logins_per_minute: 300,
-            max_connections: 1024,
-            disk_reserve: 1 << 30,
-            quota_bytes: None,
-            quota_plants: None,
-        }
-    }
-}
-
-fn parse_size(text: &str) -> Result<u64, String> {
-    let digits = text.trim_end_matches(|c: char| !c.is_ascii_digit());
-    let shift = match text[digits.len()..].trim().to_ascii_uppercase().trim_end_matches("IB").trim_end_matches('B') {
-        "" => 0,
-        "K" => 10,
-        "M" => 20,
-        "G" => 30,
-        "T" => 40,
-        _ => return Err("a size is a whole number with K, M, G or T behind it, such as 256M".to_owned()),
-    };
-    let number: u64 = digits.parse().map_err(|_| "a size begins with a whole number, such as 256M".to_owned())?;
-    number.checked_mul(1 << shift).ok_or_else(|| "the size is too large".to_owned())
-}
-
 /// An origin as browsers write it: scheme, host and port, without a slash at the end.
 fn parse_origin(text: &str) -> Result<HeaderValue, String> {
     let host = text.strip_prefix("https://").or_else(|| text.strip_prefix("http://")).unwrap_or_default();
@@ -515,30 +265,5 @@ mod tests {
         {
             assert!(parse_origin(wrong).is_err(), "{wrong}");
         }
-    }
-
-    #[test]
-    fn words_of_claims() {
-        assert_eq!(parse_scope_word("plant=admins=admin"), Ok(("plant=admins".to_owned(), Scope::Admin)));
-        assert!(parse_scope_word("admin").is_err() && parse_scope_word("=admin").is_err());
-        assert!(parse_scope_word("a=everything").is_err());
-    }
-
-    #[test]
-    fn quotas() {
-        assert_eq!(parse_quota("500G"), Ok(Quota(Some(500 << 30))));
-        assert_eq!(parse_quota("unlimited"), Ok(Quota(Some(UNLIMITED))));
-        assert_eq!(parse_quota("default"), Ok(Quota(None)));
-        assert!(parse_quota("much").is_err());
-    }
-
-    #[test]
-    fn sizes() {
-        assert_eq!(parse_size("256M"), Ok(256 << 20));
-        assert_eq!(parse_size("8 GiB"), Ok(8 << 30));
-        assert_eq!(parse_size("17"), Ok(17));
-        assert!(parse_size("M").is_err());
-        assert!(parse_size("12X").is_err());
-        assert!(parse_size("99999999999T").is_err());
     }
 }
