@@ -64,12 +64,12 @@ impl Worker {
             Some(outcome) => outcome,
             None => {
                 // Others need not wait for the leases to end, nor for the image that is being searched.
-                self.leave(&hands, GivenBack::ToAll).await;
+                self.leave(&hands).await;
                 searching.await
             }
         };
         let outcome = outcome.map_err(|_| AttemptError::Panicked).flatten();
-        self.leave(&hands, GivenBack::ToAll).await;
+        self.leave(&hands).await;
         match outcome {
             Err(AttemptError::Map(MapError::Cancelled)) => Ok(0),
             other => other,
@@ -99,10 +99,10 @@ impl Worker {
     }
 
     /// Gives back all tasks that are still held.
-    async fn leave(&self, hands: &Hands, to: GivenBack) {
+    async fn leave(&self, hands: &Hands) {
         let held: Vec<TaskClaim> = hands.held().drain().map(|(_, claim)| claim).collect();
         for claim in held {
-            if let Err(error) = self.store.give_back_task(&claim, to).await {
+            if let Err(error) = self.store.give_back_task(&claim, GivenBack::ToAll).await {
                 tracing::warn!(%error, "an image cannot be given back; its lease ends");
             }
         }
