@@ -58,30 +58,29 @@ pub fn file_tag(sha256: Digest) -> String {
     format!("\"{sha256}\"")
 }
 
-/// What a request wants to be at a file's place: a file with one of the tags of `If-Match`, or by `If-None-Match: *` none.
-pub fn wanted(headers: &HeaderMap) -> Result<Option<Wanted>, ApiError> {
-    let words = |name: header::HeaderName| -> Option<Vec<String>> {
-        let mut values = headers.get_all(name).iter().peekable();
-        values.peek()?;
-        let texts = values.filter_map(|value| value.to_str().ok());
-        Some(texts.flat_map(|text| text.split(',')).map(|word| word.trim().to_owned()).collect())
+/// What a request wants to be at a file's place: one of the files of `If-Match`, or none of those of `If-None-Match`.
+pub fn wanted(headers: &HeaderMap) -> Option<Wanted> {
+    let (only, but) = (tags(headers, header::IF_MATCH), tags(headers, header::IF_NONE_MATCH));
+    // What is no tag of a file is that of none.
+    let digests = |tags: Vec<String>| {
+        tags.iter().filter_map(|tag| tag.trim_start_matches("W/").trim_matches('"').parse().ok()).collect()
     };
-    if let Some(tags) = words(header::IF_MATCH) {
-        if tags.iter().any(|tag| tag == "*") {
-            return Ok(Some(Wanted::Anything));
-        }
-        // What is no tag of a file is that of none.
-        let digests = tags.iter().filter_map(|tag| tag.trim_start_matches("W/").trim_matches('"').parse().ok());
-        return Ok(Some(Wanted::OneOf(digests.collect())));
+    let all = |tags: &[String]| tags.iter().any(|tag| tag == "*");
+    match (only, but) {
+        (Some(tags), _) if all(&tags) => Some(Wanted::Anything),
+        (Some(tags), _) => Some(Wanted::OneOf(digests(tags))),
+        (None, Some(tags)) if all(&tags) => Some(Wanted::Nothing),
+        (None, Some(tags)) => Some(Wanted::NoneOf(digests(tags))),
+        (None, None) => None,
     }
-    match words(header::IF_NONE_MATCH) {
-        None => Ok(None),
-        Some(tags) if tags.iter().any(|tag| tag == "*") => Ok(Some(Wanted::Nothing)),
-        Some(_) => Err(ApiError::new(
-            Code::BadRequest,
-            "with an upload, if-none-match takes `*` alone: only where nothing is there",
-        )),
-    }
+}
+
+/// The tags that a header lists; `None` where there is no such header.
+fn tags(headers: &HeaderMap, name: header::HeaderName) -> Option<Vec<String>> {
+    let mut values = headers.get_all(name).iter().peekable();
+    values.peek()?;
+    let texts = values.filter_map(|value| value.to_str().ok());
+    Some(texts.flat_map(|text| text.split(',')).map(|tag| tag.trim().to_owned()).collect())
 }
 
 /// What is said where something is not as the request wants it.

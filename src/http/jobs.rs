@@ -2,7 +2,7 @@
 
 use super::AppState;
 use super::error::{ApiError, Code, Problem};
-use super::extract::{ApiPath, ApiQuery};
+use super::extract::{ApiPath, ApiQuery, Object};
 use super::paging::{List, filtered_list, state_filter};
 use super::surveys::missing_views;
 use crate::pipeline::{MapOptions, Stage};
@@ -264,12 +264,12 @@ pub async fn start(
     let asked = if body.trim_ascii().is_empty() {
         StartJob::default()
     } else {
-        serde_json::from_slice::<Option<StartJob>>(&body)
+        serde_json::from_slice::<Option<Object<StartJob>>>(&body)
             .map_err(|error| {
                 let code = if error.is_data() { Code::InvalidFields } else { Code::InvalidJson };
                 ApiError::new(code, format!("the options cannot be read: {error}"))
             })?
-            .unwrap_or_default()
+            .map_or_else(StartJob::default, |Object(asked)| asked)
     };
     let priority = asked.priority.unwrap_or(0);
     let options = asked.into_options()?;

@@ -62,8 +62,12 @@ fn encoded(value: &str) -> String {
 }
 
 /// How a name must begin. What no name holds finds none, in every database.
-pub fn prefix_filter(asked: Option<&str>) -> String {
-    asked.unwrap_or_default().replace('\0', "\u{1}")
+pub fn prefix_filter(asked: Option<&str>) -> Result<String, ApiError> {
+    let asked = asked.unwrap_or_default();
+    if asked.chars().count() > 200 {
+        return Err(ApiError::new(Code::InvalidQuery, "name is longer than 200 characters, as no name is"));
+    }
+    Ok(asked.replace('\0', "\u{1}"))
 }
 
 /// Reads a word that a list is filtered by, one of those of a state.

@@ -113,7 +113,7 @@ pub async fn list(
     caller: Caller,
     ApiQuery(query): ApiQuery<PlantsQuery>,
 ) -> Result<List<PlantView>, ApiError> {
-    let (part, prefix) = (query.part(), prefix_filter(query.name.as_deref()));
+    let (part, prefix) = (query.part(), prefix_filter(query.name.as_deref())?);
     let plants = state.store.plants(caller.organisation, caller.plants.as_deref(), &prefix, part.page()?).await?;
     part.items(&query.path("/api/v1/plants"), plants, |plant| plant.seq, PlantView::from)
 }

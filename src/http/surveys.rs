@@ -140,7 +140,7 @@ pub async fn list(
     ApiPath(plant): ApiPath<PlantId>,
     ApiQuery(query): ApiQuery<SurveysQuery>,
 ) -> Result<List<SurveyView>, ApiError> {
-    let (part, prefix) = (query.part(), prefix_filter(query.name.as_deref()));
+    let (part, prefix) = (query.part(), prefix_filter(query.name.as_deref())?);
     let page = part.page()?;
     state.require_plant(plant).await?;
     let surveys = state.store.surveys(plant, &prefix, page).await?;

@@ -69,7 +69,7 @@ pub fn uploaded(stored: Stored) -> UploadedFile {
         ("survey" = Uuid, Path, description = "The survey's identifier"),
         ("name" = String, Path, description = "The photo's file name, as the reconstruction names it"),
         ("if-match" = Option<String>, Header, description = "Only over a file with one of these tags; `*` over any"),
-        ("if-none-match" = Option<String>, Header, pattern = "^\\*$", description = "`*`: only where no file is")
+        ("if-none-match" = Option<String>, Header, description = "Only where no file with one of these tags is; `*`: none at all")
     ),
     request_body(content = Vec<u8>, content_type = "application/octet-stream", description = "A JPEG, PNG or TIFF file"),
     responses(
@@ -109,7 +109,7 @@ pub async fn put_image(
         ("survey" = Uuid, Path, description = "The survey's identifier"),
         ("path" = String, Path, description = "The file's place in OpenSfM's folder"),
         ("if-match" = Option<String>, Header, description = "Only over a file with one of these tags; `*` over any"),
-        ("if-none-match" = Option<String>, Header, pattern = "^\\*$", description = "`*`: only where no file is")
+        ("if-none-match" = Option<String>, Header, description = "Only where no file with one of these tags is; `*`: none at all")
     ),
     request_body(content = Vec<u8>, content_type = "application/octet-stream", description = "The file"),
     responses(
@@ -143,7 +143,7 @@ async fn put_one(
     let mut body = body.into_data_stream();
     let stored = async {
         let place = place?;
-        let wanted = conditional::wanted(headers)?;
+        let wanted = conditional::wanted(headers);
         state.require_survey(plant, survey).await?;
         if let Some(wanted) = &wanted {
             let there = state.store.file(survey, &place).await?.map(|file| file.sha256);

@@ -112,6 +112,8 @@ pub enum Wanted {
     Nothing,
     /// A file with one of these digests.
     OneOf(Vec<Digest>),
+    /// Nothing, or a file with none of these digests.
+    NoneOf(Vec<Digest>),
 }
 
 impl Wanted {
@@ -120,6 +122,7 @@ impl Wanted {
         match (self, there) {
             (Self::Anything, Some(_)) | (Self::Nothing, None) => true,
             (Self::OneOf(digests), Some(there)) => digests.contains(&there),
+            (Self::NoneOf(digests), there) => there.is_none_or(|there| !digests.contains(&there)),
             _ => false,
         }
     }

@@ -101,7 +101,8 @@ async fn a_job_whose_plant_is_deleted_ends() {
     let app = App::new(&[Act::Wait, Act::Map(1)]).await;
     let survey = app.complete_survey().await;
     let (_, job) = app.post(&format!("{survey}/jobs"), json!({})).await;
-    app.follow_until(&job, |job| job["state"] == "running").await;
+    // It is in the mapper's hands.
+    app.follow_until(&job, |job| job["progress"]["stage"] == "detect").await;
     app.request(reqwest::Method::DELETE, plant_path(&survey)).send().await.unwrap();
     assert_problem(app.get(&job_path(&job)).await, 404, "plant_not_found", "");
     let other = app.complete_survey().await;
@@ -119,6 +120,7 @@ async fn options_are_checked() {
     assert_problem(app.post(&jobs, json!({"rows_per_bench": 0})).await, 422, "invalid_fields", "rows_per_bench");
     assert_problem(app.post(&jobs, json!({"spacing_m": [1.0]})).await, 422, "invalid_fields", "");
     assert_problem(app.post(&jobs, json!({"max_gsd_m_per_px": -1})).await, 422, "invalid_fields", "max_gsd_m_per_px");
+    assert_problem(app.post(&jobs, json!([])).await, 422, "invalid_fields", "an object");
     let empty = app.request(reqwest::Method::POST, &jobs).send().await.unwrap();
     assert_eq!(empty.status(), StatusCode::ACCEPTED);
     assert!(empty.headers()["location"].to_str().unwrap().contains("/jobs/"));

@@ -82,6 +82,7 @@ async fn every_wrong_request_is_a_problem() {
     let broken = app.request(Method::POST, "/api/v1/plants").header("content-type", "application/json").body("{");
     assert_problem(json_of(broken.send().await.unwrap()).await, 400, "invalid_json", "");
     assert_problem(app.post("/api/v1/plants", json!({"nam": "x"})).await, 422, "invalid_fields", "nam");
+    assert_problem(app.post("/api/v1/plants", json!(["x"])).await, 422, "invalid_fields", "an object");
     assert_problem(app.post("/api/v1/plants", json!({"name": ""})).await, 422, "invalid_name", "1 to 200");
     let large = json!({"name": "x".repeat(2 << 20)});
     assert_problem(app.post("/api/v1/plants", large).await, 413, "too_large", "");

@@ -1,0 +1,150 @@
+//! Files of surveys, and how they come.
+
+use super::{at, claim, enqueue, file, model, plant, survey};
+use heliomap::reconstruction::PhotoFacts;
+use heliomap::store::{
+    Digest, FileRecord, FileWritten, Store, StoreError, SurveyId, SurveyPath, Upload, UploadId, Wanted,
+};
+use uuid::Uuid;
+
+pub async fn files_all_or_none(store: &dyn Store) {
+    let survey = survey(store, plant(store, "A").await.id, "June").await;
+    let (a, b) = (file("images/a.jpg", "a"), file("reconstruction.json", "b"));
+    let written = store.put_files(survey.id, &[a.clone(), b.clone()]).await.unwrap();
+    assert_eq!(written, [FileWritten::Created, FileWritten::Created]);
+    let mut changed = file("images/a.jpg", "other");
+    changed.size_px = Some([4, 3]);
+    let written = store.put_files(survey.id, &[changed, b]).await.unwrap();
+    assert_eq!(written, [FileWritten::Replaced, FileWritten::Unchanged]);
+    let files = store.files(survey.id).await.unwrap();
+    assert_eq!((files.len(), files[0].size, files[0].size_px), (2, 5, Some([4, 3])));
+    assert_eq!(files[0].sha256, Digest::of(b"other"));
+    let found = store.file(survey.id, &files[0].path).await.unwrap().unwrap();
+    assert_eq!((found.path, found.photo, found.shots), (files[0].path.clone(), None, None));
+    let nobody = store.put_files(heliomap::store::SurveyId(Uuid::nil()), &[a]).await;
+    assert!(matches!(nobody, Err(StoreError::Gone { what: "survey" })));
+}
+
+pub async fn photos_and_what_was_found_in_them(store: &dyn Store) {
+    let survey = survey(store, plant(store, "A").await.id, "June").await;
+    let facts: PhotoFacts = serde_json::from_value(serde_json::json!({
+        "camera": "DJI FC6310", "taken": null,
+        "position": {"latitude_deg": 50.0, "longitude_deg": 8.0, "height_m": null},
+        "quality": {"fine": 0.5, "coarse": 1.0, "dark_share": 0.0, "bright_share": 0.25},
+    }))
+    .unwrap();
+    let plain = [file("images/b.jpg", "1"), file("images/a.jpg", "1"), file("images/c.jpg", "2")];
+    store.put_files(survey.id, &plain).await.unwrap();
+    let told = FileRecord { photo: Some(facts.clone()), ..file("images/b.jpg", "1") };
+    assert_eq!(store.put_files(survey.id, &[told]).await.unwrap(), [FileWritten::Unchanged]);
+    let shots = Some(vec!["a.jpg".to_owned(), "d.jpg".to_owned()]);
+    let others = [
+        FileRecord { shots: shots.clone(), ..file("reconstruction.json", "1") },
+        file("undistorted/images/a.jpg", "1"),
+    ];
+    store.put_files(survey.id, &others).await.unwrap();
+
+    let first = store.photos(survey.id, "", 2).await.unwrap();
+    let names = |photos: &[FileRecord]| photos.iter().map(|p| p.path.file_name().to_owned()).collect::<Vec<_>>();
+    assert_eq!(names(&first), ["a.jpg", "b.jpg"]);
+    assert_eq!(names(&store.photos(survey.id, first[1].path.as_str(), 9).await.unwrap()), ["c.jpg"]);
+    assert_eq!((&first[0].photo, &first[1].photo), (&None, &Some(facts)));
+    let reconstruction = store.file(survey.id, &others[0].path).await.unwrap().unwrap();
+    assert_eq!(reconstruction.shots, shots);
+    let same = store.photos_of_digest(survey.id, Digest::of(b"1"), 9).await.unwrap();
+    assert_eq!(same.iter().map(SurveyPath::as_str).collect::<Vec<_>>(), ["images/a.jpg", "images/b.jpg"]);
+    assert_eq!(store.photos_of_digest(survey.id, Digest::of(b"1"), 1).await.unwrap().len(), 1);
+    let alike = store.photos_alike(survey.id).await.unwrap();
+    assert_eq!(alike, same.into_iter().map(|path| (Digest::of(b"1"), path)).collect::<Vec<_>>());
+}
+
+pub async fn uploads(store: &dyn Store) {
+    let survey = survey(store, plant(store, "A").await.id, "June").await;
+    let id = UploadId(Uuid::from_u128(7));
+    let mut upload = Upload {
+        id,
+        survey: survey.id,
+        length: 1 << 40,
+        received: 0,
+        partial: true,
+        metadata: "filename YS5qcGc=".to_owned(),
+        expires: at(100),
+        outcome: None,
+    };
+    store.create_upload(&upload).await.unwrap();
+    assert_eq!(store.upload(survey.id, id).await.unwrap(), Some(upload.clone()));
+    assert_eq!(store.upload(SurveyId(Uuid::nil()), id).await.unwrap(), None);
+    assert!(store.upload_received(id, 1 << 33, at(200)).await.unwrap());
+    assert!(!store.upload_received(UploadId(Uuid::nil()), 1, at(200)).await.unwrap());
+    store.end_upload(id, "{}").await.unwrap();
+    (upload.received, upload.expires, upload.outcome) = (1 << 33, at(200), Some("{}".to_owned()));
+    assert_eq!(store.upload(survey.id, id).await.unwrap(), Some(upload.clone()));
+    store.delete_expired_uploads(at(199)).await.unwrap();
+    assert_eq!(store.uploads().await.unwrap(), [id]);
+    store.delete_expired_uploads(at(200)).await.unwrap();
+    assert!(store.uploads().await.unwrap().is_empty());
+    store.create_upload(&upload).await.unwrap();
+    assert!(!store.delete_upload(SurveyId(Uuid::nil()), id).await.unwrap());
+    assert!(store.delete_upload(survey.id, id).await.unwrap());
+    upload.survey = SurveyId(Uuid::nil());
+    assert!(matches!(store.create_upload(&upload).await, Err(StoreError::Gone { what: "survey" })));
+}
+
+pub async fn a_file_is_replaced_only_where_it_is_as_wanted(store: &dyn Store) {
+    let survey = survey(store, plant(store, "A").await.id, "June").await;
+    let put = async |content: &str, wanted: Wanted| {
+        store.replace_file(survey.id, &file("images/a.jpg", content), &wanted).await.unwrap()
+    };
+    let of = |content: &str| Wanted::OneOf(vec![Digest::of(b"other"), Digest::of(content.as_bytes())]);
+    assert_eq!(put("1", Wanted::Anything).await, None);
+    assert_eq!(put("1", of("1")).await, None);
+    assert_eq!(put("1", Wanted::Nothing).await, Some(FileWritten::Created));
+    assert_eq!(put("2", Wanted::Nothing).await, None);
+    assert_eq!(put("2", of("3")).await, None);
+    assert_eq!(put("2", of("1")).await, Some(FileWritten::Replaced));
+    assert_eq!(put("2", of("2")).await, Some(FileWritten::Unchanged));
+    let none_of = |content: &str| Wanted::NoneOf(vec![Digest::of(b"other"), Digest::of(content.as_bytes())]);
+    assert_eq!(put("3", none_of("2")).await, None);
+    assert_eq!(put("4", none_of("3")).await, Some(FileWritten::Replaced));
+    assert_eq!(put("3", Wanted::Anything).await, Some(FileWritten::Replaced));
+    assert_eq!(store.files(survey.id).await.unwrap()[0].sha256, Digest::of(b"3"));
+
+    // Of many who saw the same and replace it at once, one does.
+    let many = (0..8).map(|number| {
+        let replaced = file("images/a.jpg", &format!("by {number}"));
+        async move { store.replace_file(survey.id, &replaced, &of("3")).await.unwrap() }
+    });
+    let outcomes = futures::future::join_all(many).await;
+    assert_eq!(outcomes.iter().filter(|outcome| outcome.is_some()).count(), 1, "{outcomes:?}");
+}
+
+pub async fn blobs_that_rows_name(store: &dyn Store) {
+    let (a, b) = (plant(store, "A").await.id, plant(store, "B").await.id);
+    let (june, july) = (survey(store, a, "June").await, survey(store, a, "July").await);
+    let other = survey(store, b, "June").await;
+    store.put_files(june.id, &[file("images/a.jpg", "1"), file("images/b.jpg", "22")]).await.unwrap();
+    store.put_files(july.id, &[file("images/c.jpg", "1")]).await.unwrap();
+    store.put_files(other.id, &[file("images/a.jpg", "1")]).await.unwrap();
+    enqueue(store, &june).await;
+    let running = claim(store, 0).await.unwrap();
+    store.complete_job(&running, &model(a, 1, 1), at(1)).await.unwrap();
+    let mut found = Vec::new();
+    let mut after = None;
+    loop {
+        let page = store.blobs(after, 2).await.unwrap();
+        let Some(last) = page.last() else { break };
+        after = Some((last.plant, last.sha256));
+        found.extend(page.into_iter().map(|blob| (blob.plant, blob.sha256, blob.size)));
+    }
+    let mut expected = vec![
+        (a, Digest::of(b"1"), 1),
+        (a, Digest::of(b"22"), 2),
+        (a, Digest::of(b"model"), 5),
+        (b, Digest::of(b"1"), 1),
+    ];
+    expected.sort();
+    assert_eq!(found, expected);
+    // What is replaced is named no more.
+    store.put_files(june.id, &[file("images/b.jpg", "1")]).await.unwrap();
+    assert_eq!(store.blobs(None, 9).await.unwrap().len(), 3);
+}

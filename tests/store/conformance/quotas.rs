@@ -1,0 +1,72 @@
+//! What organisations keep, and may keep.
+
+use super::{ORGANISATION, at, claim, enqueue, model, plant, survey};
+use heliomap::plant::PlantId;
+use heliomap::store::usage::UNLIMITED;
+use heliomap::store::{Created, Digest, OrganisationId, Quotas, Store, StoreError, Upload, UploadId, Usage};
+use uuid::Uuid;
+
+pub async fn quotas(store: &dyn Store) {
+    let a = plant(store, "A").await;
+    let usage = async || store.usage(ORGANISATION, at(5)).await.unwrap().unwrap();
+    let kept = Usage { bytes: 0, announced_bytes: 0, plants: 1, own: Quotas::default() };
+    assert_eq!(usage().await, kept);
+    assert!(store.usage(OrganisationId(Uuid::max()), at(5)).await.unwrap().is_none());
+
+    // The same bytes count once in a plant, whoever says so again.
+    let (one, two) = ((Digest::of(b"1"), 60), (Digest::of(b"2"), 50));
+    let none = Quotas::default();
+    store.reserve_bytes(a.id, &[one, one], none).await.unwrap();
+    store.reserve_bytes(a.id, &[one], none).await.unwrap();
+    assert_eq!(usage().await.bytes, 60);
+    let tight = Quotas { bytes: Some(100), plants: Some(1) };
+    let refused = store.reserve_bytes(a.id, &[two], tight).await;
+    assert!(matches!(refused, Err(StoreError::OverQuota { what: "bytes", used: 60, quota: 100 })), "{refused:?}");
+    assert_eq!(usage().await.bytes, 60);
+    store.reserve_bytes(a.id, &[one], Quotas { bytes: Some(10), plants: None }).await.unwrap();
+    let nowhere = store.reserve_bytes(PlantId(Uuid::nil()), &[one], none).await;
+    assert!(matches!(nowhere, Err(StoreError::Gone { what: "plant" })));
+
+    // What is said of one organisation goes before what holds for all.
+    let refused = store.create_plant(ORGANISATION, "B", tight, at(1)).await;
+    assert!(matches!(refused, Err(StoreError::OverQuota { what: "plants", used: 1, quota: 1 })), "{refused:?}");
+    assert!(matches!(store.create_plant(ORGANISATION, "A", tight, at(1)).await.unwrap(), Created::Existing(_)));
+    let own = Quotas { bytes: Some(UNLIMITED), plants: Some(2) };
+    store.set_quotas(ORGANISATION, own).await.unwrap();
+    let Created::New(b) = store.create_plant(ORGANISATION, "B", tight, at(1)).await.unwrap() else {
+        panic!("there is room for two")
+    };
+    store.reserve_bytes(b.id, &[two], tight).await.unwrap();
+    let june = survey(store, a.id, "June").await;
+    let upload = |id: u128, length, outcome: bool, expires| Upload {
+        id: UploadId(Uuid::from_u128(id)),
+        survey: june.id,
+        length,
+        received: 0,
+        partial: false,
+        metadata: String::new(),
+        expires: at(expires),
+        outcome: outcome.then(|| "{}".to_owned()),
+    };
+    for upload in [upload(1, 7, false, 9), upload(2, 70, true, 9), upload(3, 700, false, 4)] {
+        store.create_upload(&upload).await.unwrap();
+        if let Some(outcome) = &upload.outcome {
+            store.end_upload(upload.id, outcome).await.unwrap();
+        }
+    }
+    assert_eq!(usage().await, Usage { bytes: 110, announced_bytes: 7, plants: 2, own });
+
+    // A model counts, and what is deleted does not.
+    enqueue(store, &june).await;
+    let claimed = claim(store, 0).await.unwrap();
+    store.complete_job(&claimed, &model(a.id, 1, 1), at(1)).await.unwrap();
+    assert_eq!(usage().await.bytes, 115);
+    store.delete_plant(a.id, at(2)).await.unwrap();
+    assert_eq!(usage().await, Usage { bytes: 50, announced_bytes: 0, plants: 1, own });
+    let Created::New(other) = store.create_organisation("another", at(0)).await.unwrap() else {
+        panic!("there is no such organisation yet")
+    };
+    let all = store.organisations(at(5)).await.unwrap();
+    let names: Vec<_> = all.iter().map(|(organisation, usage)| (organisation.id, usage.bytes)).collect();
+    assert_eq!(names, [(other.id, 0), (ORGANISATION, 50)]);
+}

@@ -1,0 +1,104 @@
+//! Images of a job that workers share.
+
+use super::{LEASE, at, claim, enqueue, plant, survey};
+use heliomap::store::{Checkpoint, Ending, GivenBack, ImageTask, OwnTask, Store};
+
+fn tasks(images: &[&str]) -> Vec<ImageTask> {
+    let task = |image: &&str| ImageTask { image: (*image).to_owned(), document: format!("about {image}") };
+    images.iter().map(task).collect()
+}
+
+pub async fn images_of_a_job_are_shared(store: &dyn Store) {
+    let survey = survey(store, plant(store, "A").await.id, "June").await;
+    enqueue(store, &survey).await;
+    let owner = claim(store, 0).await.unwrap();
+    assert_eq!(store.take_own_task(&owner, at(0)).await.unwrap(), OwnTask::None);
+    assert!(store.offer_tasks(&owner, "f", "this version", &tasks(&["a", "b", "c", "d"])).await.unwrap());
+    assert_eq!(store.waiting_tasks(at(0)).await.unwrap(), 4);
+    assert_eq!(store.queue(at(0)).await.unwrap().images, 4);
+    // A worker of another version finds something else in the same images.
+    assert!(store.take_task("another version", LEASE, at(0)).await.unwrap().is_none());
+    let helper = store.take_task("this version", LEASE, at(0)).await.unwrap().unwrap();
+    assert_eq!((helper.plant, helper.job, &helper.task), (survey.plant, owner.job.id, &tasks(&["a"])[0]));
+    assert_eq!(store.take_own_task(&owner, at(1)).await.unwrap(), OwnTask::Image("b".to_owned()));
+    assert!(store.gather_tasks(&owner).await.unwrap().is_empty());
+
+    assert!(store.finish_task(&helper, b"in a").await.unwrap());
+    assert!(!store.finish_task(&helper, b"in a, again").await.unwrap());
+    let found = Checkpoint { name: "a".to_owned(), document: b"in a".to_vec() };
+    assert_eq!(store.checkpoints(owner.job.id, "f").await.unwrap(), std::slice::from_ref(&found));
+    assert_eq!(store.gather_tasks(&owner).await.unwrap(), [found]);
+    assert!(store.gather_tasks(&owner).await.unwrap().is_empty());
+
+    // What could not be done is for the job's own worker alone.
+    let helper = store.take_task("this version", LEASE, at(1)).await.unwrap().unwrap();
+    assert_eq!(helper.task.image, "c");
+    store.give_back_task(&helper, GivenBack::ToOwner).await.unwrap();
+    let last = store.take_task("this version", LEASE, at(1)).await.unwrap().unwrap();
+    assert_eq!(last.task.image, "d");
+    assert!(store.take_task("this version", LEASE, at(1)).await.unwrap().is_none());
+    assert_eq!(store.waiting_tasks(at(1)).await.unwrap(), 0);
+    assert_eq!(store.take_own_task(&owner, at(1)).await.unwrap(), OwnTask::Image("c".to_owned()));
+    assert_eq!(store.take_own_task(&owner, at(1)).await.unwrap(), OwnTask::InOtherHands);
+    store.give_back_task(&last, GivenBack::ToAll).await.unwrap();
+    assert_eq!(store.take_own_task(&owner, at(1)).await.unwrap(), OwnTask::Image("d".to_owned()));
+    assert_eq!(store.take_own_task(&owner, at(1)).await.unwrap(), OwnTask::None);
+    let own: Vec<_> = ["b", "c", "d"].map(|name| Checkpoint { name: name.to_owned(), document: vec![1] }).into();
+    assert!(store.checkpoint(&owner, "f", &own).await.unwrap());
+    assert_eq!(store.checkpoints(owner.job.id, "f").await.unwrap().len(), 4);
+}
+
+pub async fn images_in_silent_hands_come_back(store: &dyn Store) {
+    let survey = survey(store, plant(store, "A").await.id, "June").await;
+    enqueue(store, &survey).await;
+    assert!(claim(store, 0).await.is_some());
+    let owner = claim(store, 100).await.unwrap();
+    store.offer_tasks(&owner, "f", "v", &tasks(&["a", "b"])).await.unwrap();
+    let silent = store.take_task("v", LEASE, at(100)).await.unwrap().unwrap();
+    let alive = store.take_task("v", LEASE, at(100)).await.unwrap().unwrap();
+    assert_eq!(store.extend_tasks(&[alive.token], LEASE, at(120)).await.unwrap(), [alive.token]);
+    assert_eq!(store.take_own_task(&owner, at(130)).await.unwrap(), OwnTask::InOtherHands);
+    assert!(store.take_task("v", LEASE, at(130)).await.unwrap().is_none());
+    let second = store.take_task("v", LEASE, at(131)).await.unwrap().unwrap();
+    assert_eq!((second.task.image.as_str(), second.token != silent.token), ("a", true));
+    // Who was silent has lost it, and changes nothing any more.
+    assert!(store.extend_tasks(&[silent.token], LEASE, at(132)).await.unwrap().is_empty());
+    assert!(!store.finish_task(&silent, b"late").await.unwrap());
+    store.give_back_task(&silent, GivenBack::ToOwner).await.unwrap();
+    assert_eq!(store.take_own_task(&owner, at(151)).await.unwrap(), OwnTask::Image("b".to_owned()));
+    assert!(!store.finish_task(&alive, b"late").await.unwrap());
+    assert!(store.finish_task(&second, b"in a").await.unwrap());
+    // Others' work counts as the job's: this was its last attempt, and it has another.
+    assert_eq!(claim(store, 200).await.unwrap().job.attempt, 3);
+}
+
+pub async fn images_go_with_their_job(store: &dyn Store) {
+    let survey = survey(store, plant(store, "A").await.id, "June").await;
+    let job = enqueue(store, &survey).await;
+    let first = claim(store, 0).await.unwrap();
+    store.offer_tasks(&first, "f", "v", &tasks(&["a", "b"])).await.unwrap();
+    let held = store.take_task("v", LEASE, at(0)).await.unwrap().unwrap();
+    // The next worker offers anew; what was held before is lost.
+    let second = claim(store, 40).await.unwrap();
+    assert!(!store.offer_tasks(&first, "f", "v", &tasks(&["a"])).await.unwrap());
+    assert_eq!(store.take_own_task(&first, at(40)).await.unwrap(), OwnTask::InOtherHands);
+    assert!(store.offer_tasks(&second, "g", "v", &tasks(&["a", "b"])).await.unwrap());
+    assert!(!store.finish_task(&held, b"late").await.unwrap());
+    assert!(store.checkpoints(job.id, "g").await.unwrap().is_empty());
+
+    let held = store.take_task("v", LEASE, at(41)).await.unwrap().unwrap();
+    store.cancel_job(job.plant, job.id, at(42)).await.unwrap();
+    assert!(store.take_task("v", LEASE, at(42)).await.unwrap().is_none());
+    assert!(store.extend_tasks(&[held.token], LEASE, at(42)).await.unwrap().is_empty());
+    assert_eq!(store.waiting_tasks(at(42)).await.unwrap(), 0);
+    assert!(store.end_job(&second, &Ending::Cancelled, at(43)).await.unwrap());
+    assert!(!store.finish_task(&held, b"late").await.unwrap());
+    assert_eq!(store.take_own_task(&second, at(43)).await.unwrap(), OwnTask::None);
+
+    // A plant that is deleted takes them along.
+    enqueue(store, &survey).await;
+    let third = claim(store, 50).await.unwrap();
+    store.offer_tasks(&third, "f", "v", &tasks(&["a"])).await.unwrap();
+    store.delete_plant(survey.plant, at(51)).await.unwrap();
+    assert_eq!(store.waiting_tasks(at(51)).await.unwrap(), 0);
+}
