@@ -372,6 +372,8 @@ pub struct LayerInfo {
     pub extent: Option<GeoBox>,
     /// The largest extent of one feature from south to north, degrees.
     pub tallest_deg: f64,
+    /// The largest extent of one feature from west to east, degrees.
+    pub widest_deg: f64,
 }
 
 /// A part of a layer: at most `limit` features after the one with the sequence number `after` that touch a box.
@@ -420,6 +422,11 @@ impl GeoBox {
             max_lon: self.max_lon.max(other.max_lon),
             max_lat: self.max_lat.max(other.max_lat),
         }
+    }
+
+    /// Degrees from west to east.
+    pub fn width_deg(self) -> f64 {
+        self.max_lon - self.min_lon
     }
 
     /// Degrees from south to north.

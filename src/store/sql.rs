@@ -373,11 +373,11 @@ pub const INSERT_MODEL: &str = concat!(
     model!()
 );
 pub const INSERT_LAYER: &str = "\
-    INSERT INTO layers (model_seq, layer, features, properties, min_lon, min_lat, max_lon, max_lat, tallest_deg) \
-    VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9)";
+    INSERT INTO layers (model_seq, layer, features, properties, min_lon, min_lat, max_lon, max_lat, tallest_deg, \
+    widest_deg) VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10)";
 pub const INSERT_FEATURE: &str = "\
-    INSERT INTO features (model_seq, layer, seq, id, label, feature, min_lon, min_lat, max_lon, max_lat) \
-    VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10)";
+    INSERT INTO features (model_seq, layer, seq, id, label, feature, min_lon, min_lat, max_lon, max_lat, strip) \
+    VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11)";
 
 pub const MODELS: &str =
     concat!("SELECT ", model!(), " FROM models WHERE plant_id = $1 AND seq < $2 ORDER BY seq DESC LIMIT $3");
@@ -385,7 +385,7 @@ pub const MODEL: &str = concat!("SELECT ", model!(), " FROM models WHERE plant_i
 pub const NEWEST_MODEL: &str =
     concat!("SELECT ", model!(), " FROM models WHERE plant_id = $1 ORDER BY version DESC LIMIT 1");
 pub const LAYER: &str = "\
-    SELECT features, properties, min_lon, min_lat, max_lon, max_lat, tallest_deg FROM layers \
+    SELECT features, properties, min_lon, min_lat, max_lon, max_lat, tallest_deg, widest_deg FROM layers \
     WHERE model_seq = $1 AND layer = $2";
 
 pub const FEATURES: &str = "\
@@ -395,14 +395,17 @@ pub const FEATURES: &str = "\
 pub const FEATURES_IN_LARGE_BOX: &str = "\
     SELECT seq, feature FROM features WHERE model_seq = $1 AND layer = $2 AND seq > $3 \
     AND +min_lon <= $7 AND +max_lon >= $5 AND +min_lat <= $8 AND +max_lat >= $6 ORDER BY seq LIMIT $4";
-/// A box that covers little of the layer: take the strip of latitudes from the index by place (which holds all that
-/// the condition asks for) and put what is in the box in order. `$9` is the southernmost latitude at which a feature
-/// that reaches into the box may begin.
+/// A box that covers little of the layer: in each strip from `$10` to `$11` take the latitudes from the index by place (which
+/// holds all that the condition asks for), and put what is in the box in order. `$9` is the southernmost latitude at which
+/// a feature that reaches into the box may begin. Cross joins and unary pluses hold the planner to that way.
 pub const FEATURES_IN_SMALL_BOX: &str = "\
-    SELECT seq, feature FROM features WHERE model_seq = $1 AND layer = $2 AND seq IN (SELECT near.seq \
-    FROM features AS near WHERE near.model_seq = $1 AND near.layer = $2 AND near.min_lat BETWEEN $9 AND $8 \
-    AND near.max_lat >= $6 AND near.min_lon <= $7 AND near.max_lon >= $5 AND +near.seq > $3 \
-    ORDER BY +near.seq LIMIT $4) ORDER BY seq";
+    WITH RECURSIVE strips (strip) AS (SELECT CAST($10 AS BIGINT) UNION ALL SELECT strip + 1 FROM strips WHERE strip < $11), \
+    near AS MATERIALIZED (SELECT place.seq AS seq FROM strips CROSS JOIN features AS place \
+    WHERE place.model_seq = $1 AND place.layer = $2 AND place.strip = strips.strip AND place.min_lat BETWEEN $9 AND $8 \
+    AND place.max_lat >= $6 AND place.min_lon <= $7 AND place.max_lon >= $5 AND +place.seq > $3 \
+    ORDER BY +place.seq LIMIT $4) \
+    SELECT features.seq, features.feature FROM near CROSS JOIN features \
+    WHERE features.model_seq = $1 AND features.layer = $2 AND features.seq = near.seq ORDER BY near.seq";
 pub const MODULE: &str = "SELECT feature FROM features WHERE id = $1 AND model_seq = $2 AND layer = 'modules'";
 pub const MODULE_LAST_SEEN: &str = "\
     SELECT models.version FROM features JOIN models ON models.seq = features.model_seq \

@@ -30,12 +30,14 @@ from service import Service  # noqa: E402
 #: Degrees from one module to the next: about 1 m east, 2 m north.
 EAST, NORTH = 1.4e-5, 1.8e-5
 WEST_END, SOUTH_END = 8.0, 50.0
+#: Degrees of a strip by which the service finds features.
+STRIP = 0.0005
 #: Bounds in milliseconds.
 BOUNDS = {"module": 5.0, "box": 25.0, "plant": 50.0}
 
 
 def feature(rng: random.Random, plant: str, row: int, column: int) -> tuple:
-    """A module as the service stores it: identifier, label, GeoJSON, box."""
+    """A module as the service stores it: identifier, label, GeoJSON, box, strip."""
     west, south = WEST_END + column * EAST, SOUTH_END + row * NORTH
     east, north = west + 0.9 * EAST, south + 0.9 * NORTH
     identifier = str(uuid.UUID(int=rng.getrandbits(128), version=5))
@@ -54,7 +56,8 @@ def feature(rng: random.Random, plant: str, row: int, column: int) -> tuple:
             "images": [f"DJI_{rng.randrange(10000):04}.JPG" for _ in range(4)], "status": "detected",
         },
     }
-    return identifier, label, json.dumps(document, separators=(",", ":")), west, south, east, north
+    strip = math.floor((west + 180) / STRIP)
+    return identifier, label, json.dumps(document, separators=(",", ":")), west, south, east, north, strip
 
 
 class Rows:
@@ -79,7 +82,7 @@ class Rows:
         if self.sqlite:
             self.sqlite.execute("BEGIN")
             rows = ((model, "modules", seq, *row) for seq, row in enumerate(features, 1))
-            self.sqlite.executemany("INSERT INTO features VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", rows)
+            self.sqlite.executemany("INSERT INTO features VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", rows)
             self.sqlite.execute("COMMIT")
             return
         feed = io.StringIO()
@@ -108,9 +111,9 @@ class Rows:
 
         self.features(model, made())
         name = json.dumps({"name": "Query", "model_version": 1})
-        extent = f"{WEST_END}, {SOUTH_END}, {WEST_END + columns * EAST}, {SOUTH_END + rows * NORTH}, {0.9 * NORTH}"
+        extent = f"{WEST_END}, {SOUTH_END}, {WEST_END + columns * EAST}, {SOUTH_END + rows * NORTH}, {0.9 * NORTH}, {0.9 * EAST}"
         self.execute(
-            "INSERT INTO layers (model_seq, layer, features, properties, min_lon, min_lat, max_lon, max_lat, tallest_deg) "
+            "INSERT INTO layers (model_seq, layer, features, properties, min_lon, min_lat, max_lon, max_lat, tallest_deg, widest_deg) "
             f"VALUES ({model}, 'modules', {rows * columns}, '{name}', {extent})"
         )
         return some

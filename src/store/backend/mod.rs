@@ -431,6 +431,7 @@ impl Store for Rows {
                 .bind(extent.map(|b| b.max_lon))
                 .bind(extent.map(|b| b.max_lat))
                 .bind(extents().map(GeoBox::height_deg).fold(0.0, f64::max))
+                .bind(extents().map(GeoBox::width_deg).fold(0.0, f64::max))
                 .execute(&mut *tx)
                 .await?;
             for (index, feature) in layer.features.iter().enumerate() {
@@ -517,22 +518,20 @@ impl Store for Rows {
             properties: row.try_get("properties")?,
             extent,
             tallest_deg: row.try_get("tallest_deg")?,
+            widest_deg: row.try_get("widest_deg")?,
         }))
     }
 
     async fn features(&self, layer: &LayerInfo, page: FeatureQuery) -> Result<Vec<Feature>, StoreError> {
-        let small = |within: GeoBox| {
-            let share = |covered: f64, whole: f64| if whole > 0.0 { (covered / whole).clamp(0.0, 1.0) } else { 1.0 };
-            layer.extent.is_none_or(|extent| {
-                share(within.max_lon - within.min_lon, extent.max_lon - extent.min_lon)
-                    * share(within.height_deg(), extent.height_deg())
-                    < SMALL_BOX_SHARE
-            })
+        let share = |covered: f64, whole: f64| if whole > 0.0 { (covered / whole).clamp(0.0, 1.0) } else { 1.0 };
+        let is_small = |within: GeoBox, extent: GeoBox| {
+            share(within.width_deg(), extent.width_deg()) * share(within.height_deg(), extent.height_deg())
+                < SMALL_BOX_SHARE
         };
-        let statement = match page.within {
-            None => sql::FEATURES,
-            Some(within) if small(within) => sql::FEATURES_IN_SMALL_BOX,
-            Some(_) => sql::FEATURES_IN_LARGE_BOX,
+        let statement = match (page.within, layer.extent) {
+            (None, _) => sql::FEATURES,
+            (Some(within), Some(extent)) if is_small(within, extent) => sql::FEATURES_IN_SMALL_BOX,
+            (Some(_), _) => sql::FEATURES_IN_LARGE_BOX,
         };
         let mut query = sqlx::query(statement)
             .bind(layer.model_seq)
@@ -541,8 +540,11 @@ impl Store for Rows {
             .bind(i64::from(page.limit));
         if let Some(within) = page.within {
             query = query.bind(within.min_lon).bind(within.min_lat).bind(within.max_lon).bind(within.max_lat);
-            if small(within) {
-                query = query.bind(within.min_lat - layer.tallest_deg);
+            if let Some(extent) = layer.extent.filter(|extent| is_small(within, *extent)) {
+                query = query
+                    .bind(within.min_lat - layer.tallest_deg)
+                    .bind(strip((within.min_lon - layer.widest_deg).max(extent.min_lon)))
+                    .bind(strip(within.max_lon.min(extent.max_lon)));
             }
         }
         let rows = query.fetch_all(&self.read).await?;
@@ -640,9 +642,17 @@ async fn insert_feature(
         .bind(feature.extent.map(|b| b.min_lat))
         .bind(feature.extent.map(|b| b.max_lon))
         .bind(feature.extent.map(|b| b.max_lat))
+        .bind(feature.extent.map(|b| strip(b.min_lon)))
         .execute(&mut **tx)
         .await?;
     Ok(())
+}
+
+/// The strip from pole to pole in which a longitude lies, by which features are found; migrations compute the same.
+fn strip(lon: f64) -> i64 {
+    /// Some 30 to 55 m where people live.
+    const WIDTH_DEG: f64 = 0.0005;
+    ((lon + 180.0) / WIDTH_DEG).floor() as i64
 }
 
 /// Milliseconds at the end of a lease that begins now.
