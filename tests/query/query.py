@@ -149,7 +149,7 @@ def main() -> int:
     name = "Postgres" if args.database else "SQLite"
     with tempfile.TemporaryDirectory(prefix="heliomap-query-") as folder:
         data = Path(folder)
-        with Service(data, "--no-worker", database=args.database) as service:
+        with Service(data, "--no-worker", "--max-requests-per-second", "100000", database=args.database) as service:
             client = Client(service.url, service.key)
             large, small = (client.create_plant(plant)["id"] for plant in ("large", "small"))
         rows = Rows(data, args.database)
