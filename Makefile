@@ -17,7 +17,7 @@ export ORT_DYLIB_PATH ?= $(abspath $(ORT_LIBRARY))
 HELIOMAP_DATA ?= $(wildcard ../shared/data)
 export HELIOMAP_DATA
 
-.PHONY: help setup web demo test lint unit client kills tus contract query load scale-out deploy-lint fuzz structure bench scaling yolo-export openapi configuration clean
+.PHONY: help setup web demo test lint unit client kills tus contract query load scale-out tenants deploy-lint fuzz structure bench scaling yolo-export openapi configuration clean
 
 help: ## List the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -102,6 +102,9 @@ scale-out: setup .venv/s3/done ## Two workers on one core each against one, over
 	$(CARGO) build --release --locked
 	$(PYTHON) tests/scale/scale_out.py
 
+tenants: setup ## One organisation's key tries every operation on another's objects: 404 everywhere
+	$(CARGO) test --locked --test http tenants -- --nocapture
+
 deploy-lint: .venv/deploy/done ## Lint the Dockerfile, compose.yaml and the Helm chart
 	@.venv/deploy/bin/python deploy/lint.py
 
@@ -158,4 +161,4 @@ configuration: ## Write docs/CONFIGURATION.md anew from the command line
 	$(CARGO) run --locked --quiet -- configuration > CONFIGURATION.md.new && mv CONFIGURATION.md.new docs/CONFIGURATION.md
 
 clean: ## Remove everything that was built or fetched
-	rm -rf target .ort web/dist web/node_modules
+	rm -rf target .ort .venv .cargo-fuzz fuzz/target web/dist web/node_modules tests/tus/node_modules

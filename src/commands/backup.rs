@@ -2,13 +2,14 @@
 
 use super::{open_blobs, open_storage, run_async};
 use anyhow::{Context, bail, ensure};
-use futures::{StreamExt, TryStreamExt, stream};
+use futures::{Stream, TryStreamExt, stream};
 use heliomap::config::{BackupArgs, RestoreArgs, StorageArgs, VerifyArgs};
 use heliomap::store::{BlobRecord, Blobs, Digest, SqliteStore, StagedFile, Store, UploadStore};
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
+use std::pin::pin;
 
 /// The rows, in a backup as in a data folder.
 const ROWS: &str = "heliomap.db";
@@ -46,36 +47,33 @@ pub fn backup(args: BackupArgs) -> anyhow::Result<()> {
         let snapshot = SqliteStore::open(&target).await?;
         snapshot.delete_expired_uploads(Timestamp::MAX).await?;
         let (mut count, mut bytes) = (0, 0);
-        let mut after = None;
-        loop {
-            let page = snapshot.blobs(after, PAGE).await?;
-            let Some(last) = page.last() else { break };
-            after = Some((last.plant, last.sha256));
-            for blob in page {
-                let place = folder.join(place(&blob));
-                let parent = place.parent().context("a blob lies in a folder")?;
-                std::fs::create_dir_all(parent).with_context(|| format!("creating {}", parent.display()))?;
-                match blobs.copy(blob.plant, blob.sha256, &place).await {
-                    Ok(()) => {
-                        sync(&place)?;
-                        count += 1;
-                        bytes += blob.size;
-                    }
-                    // Its plant was deleted meanwhile: that holds here, too.
-                    Err(_) if live.plant(blob.plant).await?.is_none() => {
-                        snapshot.delete_plant(blob.plant, Timestamp::now()).await?;
-                    }
-                    Err(error) => {
-                        return Err(error).context("a blob cannot be copied; `heliomap verify` lists all such");
-                    }
+        let mut recorded = pin!(recorded(&snapshot));
+        while let Some(blob) = recorded.try_next().await? {
+            let place = folder.join(place(&blob));
+            let parent = place.parent().context("a blob lies in a folder")?;
+            std::fs::create_dir_all(parent).with_context(|| format!("creating {}", parent.display()))?;
+            match blobs.copy(blob.plant, blob.sha256, &place).await {
+                Ok(()) => {
+                    sync(&place)?;
+                    count += 1;
+                    bytes += blob.size;
+                }
+                // Its plant was deleted meanwhile: that holds here, too.
+                Err(_) if live.plant(blob.plant).await?.is_none() => {
+                    snapshot.delete_plant(blob.plant, Timestamp::now()).await?;
+                }
+                Err(error) => {
+                    return Err(error).context("a blob cannot be copied; `heliomap verify` lists all such");
                 }
             }
         }
         snapshot.close().await;
         let _ = std::fs::remove_file(target.with_extension("lock"));
+        sync(&target)?;
         let manifest =
             Manifest { version: env!("CARGO_PKG_VERSION").to_owned(), created: Timestamp::now(), blobs: count, bytes };
         write_synced(&folder.join(MANIFEST), &serde_json::to_vec_pretty(&manifest)?)?;
+        sync(folder)?;
         println!("{count} blobs of {bytes} bytes and their rows are in {}", folder.display());
         Ok(())
     })
@@ -123,42 +121,33 @@ pub fn restore(args: RestoreArgs) -> anyhow::Result<()> {
 
 /// Stores all blobs that the rows name, from a backup; how many.
 async fn take_blobs(store: &dyn Store, blobs: &Blobs, backup: &Path) -> anyhow::Result<u64> {
-    let (mut count, mut after) = (0, None);
-    loop {
-        let page = store.blobs(after, PAGE).await?;
-        let Some(last) = page.last() else { return Ok(count) };
-        after = Some((last.plant, last.sha256));
-        for blob in page {
-            let source = backup.join(place(&blob));
-            let staged = tempfile::Builder::new().prefix("restore-").tempfile_in(blobs.staging())?.into_temp_path();
-            std::fs::copy(&source, &staged).with_context(|| format!("the backup lacks {}", source.display()))?;
-            let sha256 = Digest::of_file(&staged)?;
-            ensure!(sha256 == blob.sha256, "{} is damaged: it holds other bytes", source.display());
-            sync(&staged)?;
-            blobs.put_file(blob.plant, StagedFile { path: staged, size: blob.size, sha256 }).await?;
-            count += 1;
-        }
+    let mut count = 0;
+    let mut recorded = pin!(recorded(store));
+    while let Some(blob) = recorded.try_next().await? {
+        let source = backup.join(place(&blob));
+        let staged = tempfile::Builder::new().prefix("restore-").tempfile_in(blobs.staging())?.into_temp_path();
+        std::fs::copy(&source, &staged).with_context(|| format!("the backup lacks {}", source.display()))?;
+        let sha256 = Digest::of_file(&staged)?;
+        ensure!(sha256 == blob.sha256, "{} is damaged: it holds other bytes", source.display());
+        sync(&staged)?;
+        blobs.put_file(blob.plant, StagedFile { path: staged, size: blob.size, sha256 }).await?;
+        count += 1;
     }
+    Ok(count)
 }
 
 /// Checks that every blob that the rows name is there.
 pub fn verify(args: VerifyArgs) -> anyhow::Result<()> {
     run_async(async {
         let (store, blobs) = open_storage(&args.storage).await?;
-        let (mut count, mut wrong, mut after) = (0_u64, Vec::new(), None);
-        loop {
-            let page = store.blobs(after, PAGE).await?;
-            let Some(last) = page.last() else { break };
-            after = Some((last.plant, last.sha256));
-            count += page.len() as u64;
-            let (blobs, content) = (&blobs, args.content);
-            let looks = stream::iter(page).map(|blob| async move {
-                let fault = blobs.check(blob.plant, blob.sha256, blob.size, content).await?;
-                anyhow::Ok(fault.map(|fault| format!("plant {}, blob {}: {fault}", blob.plant, blob.sha256)))
-            });
-            let faults: Vec<_> = looks.buffered(LOOKS_AT_ONCE).try_collect().await?;
-            wrong.extend(faults.into_iter().flatten());
-        }
+        let (blobs, content) = (&blobs, args.content);
+        let looks = recorded(&*store).map_ok(|blob| async move {
+            let fault = blobs.check(blob.plant, blob.sha256, blob.size, content).await?;
+            anyhow::Ok(fault.map(|fault| format!("plant {}, blob {}: {fault}", blob.plant, blob.sha256)))
+        });
+        let looked: Vec<Option<String>> = looks.try_buffered(LOOKS_AT_ONCE).try_collect().await?;
+        let count = looked.len();
+        let wrong: Vec<String> = looked.into_iter().flatten().collect();
         for fault in wrong.iter().take(NAMED) {
             println!("{fault}");
         }
@@ -170,6 +159,16 @@ pub fn verify(args: VerifyArgs) -> anyhow::Result<()> {
         println!("all {count} blobs are there");
         Ok(())
     })
+}
+
+/// All blobs that the rows name.
+fn recorded(store: &dyn Store) -> impl Stream<Item = anyhow::Result<BlobRecord>> + '_ {
+    let pages = stream::try_unfold(None, move |after| async move {
+        let page = store.blobs(after, PAGE).await?;
+        let last = page.last().map(|last| (last.plant, last.sha256));
+        anyhow::Ok(last.map(|last| (stream::iter(page.into_iter().map(anyhow::Ok)), Some(last))))
+    });
+    pages.try_flatten()
 }
 
 /// Where a blob lies in a backup, as in a data folder.

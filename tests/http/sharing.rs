@@ -195,8 +195,8 @@ async fn a_helper_that_stops_gives_back_what_it_held() {
         tokio::time::sleep(Duration::from_millis(2)).await;
     }
     helping.cancel();
-    // The leases are of 10 s, for which nobody waits.
+    // The leases are of a minute, for which nobody waits.
     let told = Instant::now();
     assert_eq!(app.follow(&job).await["state"], "succeeded");
-    assert!(told.elapsed() < Duration::from_secs(8), "{:?}", told.elapsed());
+    assert!(told.elapsed() < Duration::from_secs(40), "{:?}", told.elapsed());
 }

@@ -134,6 +134,7 @@ async fn what_another_organisation_owns_is_not_there() {
     }
     app.secret = owner;
     assert_eq!(seen(&app, &owned).await, before, "a stranger changed something");
+    println!("{} operations tried on another organisation's objects", operations().len());
 }
 
 #[tokio::test]

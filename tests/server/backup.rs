@@ -5,7 +5,7 @@ use reqwest::StatusCode;
 use reqwest::blocking::Client;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Runs the program to its end; whether it succeeded, and what it said.
@@ -244,8 +244,7 @@ fn postgres_and_a_bucket_are_restored_by_their_own_tools() {
     };
     let client = client();
     let serve = |database: &str| -> (Program, String) {
-        let (program, line) = super::spawn(command(&["serve", "--insecure", "--listen", "127.0.0.1:0"], database));
-        (program, line.trim().strip_prefix("heliomap is listening on ").unwrap().to_owned())
+        super::listening(command(&["serve", "--insecure", "--listen", "127.0.0.1:0"], database), Stdio::null())
     };
     let (program, base) = serve(&first);
     let (survey, job) = super::broken_survey_with_job(&client, &base);

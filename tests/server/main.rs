@@ -52,19 +52,31 @@ impl Program {
 fn start(data: &Path, arguments: &[&str]) -> (Program, String) {
     let mut command = Command::new(env!("CARGO_BIN_EXE_heliomap"));
     command.args(arguments).env("HELIOMAP_DATA_DIR", data);
-    spawn(command)
+    spawn(command, Stdio::null())
 }
 
-/// Starts a program; its first line of output.
-fn spawn(mut command: Command) -> (Program, String) {
-    let mut child = command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
+/// Starts a program that logs to `log`; its first line of output.
+fn spawn(mut command: Command, log: impl Into<Stdio>) -> (Program, String) {
+    let mut child = command.stdout(Stdio::piped()).stderr(log).spawn().unwrap();
     let mut line = String::new();
     BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
     (Program(child), line)
 }
 
 fn serve(data: &Path, more: &[&str]) -> (Program, String) {
-    let (program, line) = start(data, &[&["serve", "--insecure", "--listen", "127.0.0.1:0"], more].concat());
+    let mut command = Command::new(env!("CARGO_BIN_EXE_heliomap"));
+    command.args(["serve", "--insecure", "--listen", "127.0.0.1:0"]).args(more).env("HELIOMAP_DATA_DIR", data);
+    listening(command, Stdio::null())
+}
+
+/// Starts a service that logs into the file `log` of its data folder.
+fn serve_logged(data: &Path, command: Command) -> (Program, String) {
+    listening(command, std::fs::File::create(data.join("log")).unwrap())
+}
+
+/// Starts a service that logs to `log`; its address.
+fn listening(command: Command, log: impl Into<Stdio>) -> (Program, String) {
+    let (program, line) = spawn(command, log);
     let base = line.trim().strip_prefix("heliomap is listening on ").expect("the address is printed");
     (program, base.to_owned())
 }
@@ -203,18 +215,12 @@ fn the_description_is_printed() {
 #[test]
 fn logs_name_requests_and_jobs_and_hold_no_secret() {
     let data = tempfile::tempdir().unwrap();
-    let mut child = Command::new(env!("CARGO_BIN_EXE_heliomap"))
+    let mut command = Command::new(env!("CARGO_BIN_EXE_heliomap"));
+    command
         .args(["serve", "--insecure", "--listen", "127.0.0.1:0", "--log", "trace", "--log-format", "json"])
         .env("HELIOMAP_DATA_DIR", data.path())
-        .env("HELIOMAP_WEBHOOK_PRIVATE_TARGETS", "true")
-        .stdout(Stdio::piped())
-        .stderr(std::fs::File::create(data.path().join("log")).unwrap())
-        .spawn()
-        .unwrap();
-    let mut line = String::new();
-    BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
-    let program = Program(child);
-    let base = line.trim().strip_prefix("heliomap is listening on ").unwrap();
+        .env("HELIOMAP_WEBHOOK_PRIVATE_TARGETS", "true");
+    let (program, base) = serve_logged(data.path(), command);
     let client = client();
     let (secret, password) = ("hm_5ec2e75ec2e75ec2e7", "pa55w0rd");
     let request = client.get(format!("{base}/api/v1/plants")).header("x-request-id", "call-7").bearer_auth(secret);
@@ -223,8 +229,8 @@ fn logs_name_requests_and_jobs_and_hold_no_secret() {
     let key: Value = client.post(format!("{base}/api/v1/keys")).json(&key).send().unwrap().json().unwrap();
     let hook = json!({"url": "http://127.0.0.1:9/pa55w0rd?token=pa55w0rd"});
     let hook: Value = client.post(format!("{base}/api/v1/webhooks")).json(&hook).send().unwrap().json().unwrap();
-    let (_, job) = broken_survey_with_job(&client, base);
-    follow(&client, base, &job);
+    let (_, job) = broken_survey_with_job(&client, &base);
+    follow(&client, &base, &job);
     let deliveries = format!("{base}/api/v1/webhooks/{}/deliveries", hook["id"].as_str().unwrap());
     let begun = Instant::now();
     while client.get(&deliveries).send().unwrap().json::<Value>().unwrap()["items"][0]["error"].is_null() {
@@ -274,18 +280,10 @@ fn blobs_lie_in_a_bucket() {
     let text = String::from_utf8_lossy(&output.stderr);
     assert!(!output.status.success() && text.contains("--blobs") && !text.contains(secret), "{text}");
 
-    let mut child = command(format!("s3://heliomap-tests/{prefix}"))
-        .stdout(Stdio::piped())
-        .stderr(std::fs::File::create(data.path().join("log")).unwrap())
-        .spawn()
-        .unwrap();
-    let mut line = String::new();
-    BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
-    let program = Program(child);
-    let base = line.trim().strip_prefix("heliomap is listening on ").expect("the address is printed");
+    let (program, base) = serve_logged(data.path(), command(format!("s3://heliomap-tests/{prefix}")));
     let client = client();
-    let (_, job) = broken_survey_with_job(&client, base);
-    let job = follow(&client, base, &job);
+    let (_, job) = broken_survey_with_job(&client, &base);
+    let job = follow(&client, &base, &job);
     assert_eq!(job["error"]["code"], "reconstruction_malformed", "{job}");
     assert!(!data.path().join("blobs").exists());
     let list = format!("{endpoint}/heliomap-tests?list-type=2&prefix={prefix}/");

@@ -1,11 +1,11 @@
 //! Traces to a real receiver: what is sent is protobuf, and tells of the service, of requests and of a job's stages.
 
-use crate::{Program, broken_survey_with_job, client, follow};
+use crate::{broken_survey_with_job, client, follow, serve_logged};
 use reqwest::StatusCode;
 use serde_json::Value;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpListener;
-use std::process::{Command, Stdio};
+use std::process::Command;
 use std::sync::{Arc, Mutex};
 
 /// What was posted: path, content type and body of each request.
@@ -60,24 +60,18 @@ fn holds(body: &[u8], part: &[u8]) -> bool {
 fn requests_and_the_stages_of_jobs_are_traced() {
     let (endpoint, posted) = collector();
     let data = tempfile::tempdir().unwrap();
-    let mut child = Command::new(env!("CARGO_BIN_EXE_heliomap"))
+    let mut command = Command::new(env!("CARGO_BIN_EXE_heliomap"));
+    command
         .args(["serve", "--insecure", "--listen", "127.0.0.1:0", "--log", "error", "--otlp-endpoint", &endpoint])
-        .env("HELIOMAP_DATA_DIR", data.path())
-        .stdout(Stdio::piped())
-        .stderr(std::fs::File::create(data.path().join("log")).unwrap())
-        .spawn()
-        .unwrap();
-    let mut line = String::new();
-    BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
-    let program = Program(child);
-    let base = line.trim().strip_prefix("heliomap is listening on ").unwrap();
+        .env("HELIOMAP_DATA_DIR", data.path());
+    let (program, base) = serve_logged(data.path(), command);
     let client = client();
     let trace = "0af7651916cd43dd8448eb211c80319c";
     let request =
         client.get(format!("{base}/api/v1/plants")).header("traceparent", format!("00-{trace}-b7ad6b7169203331-01"));
     assert_eq!(request.send().unwrap().status(), StatusCode::OK);
-    let (_, job) = broken_survey_with_job(&client, base);
-    let ended: Value = follow(&client, base, &job);
+    let (_, job) = broken_survey_with_job(&client, &base);
+    let ended: Value = follow(&client, &base, &job);
     assert_eq!(ended["state"], "failed");
     // The last of them are sent when the process stops.
     assert!(program.terminate().success());

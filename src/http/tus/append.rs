@@ -1,16 +1,13 @@
 //! More of an upload comes, and is made safe step by step.
 
 use super::finish::finish;
-use super::protocol::{
-    Checksum, UPLOAD_EXPIRES, UPLOAD_OFFSET, answer, http_date, number, require_version, text, wrong,
-};
-use super::{LIFE, require_upload};
+use super::protocol::{Checksum, UPLOAD_EXPIRES, UPLOAD_OFFSET, answer, http_date, number, text, wrong};
+use super::{LIFE, UploadPath, take};
 use crate::http::AppState;
 use crate::http::error::{ApiError, Code, Problem};
 use crate::http::extract::ApiPath;
 use crate::http::intake::disk;
-use crate::plant::PlantId;
-use crate::store::{SurveyId, Upload, UploadId};
+use crate::store::Upload;
 use axum::body::{Body, BodyDataStream};
 use axum::extract::State;
 use axum::http::{HeaderMap, StatusCode};
@@ -35,9 +32,7 @@ const STEP: u64 = 8 << 20;
     tag = "surveys",
     security(("key" = ["upload"])),
     params(
-        ("plant" = Uuid, Path, description = "The plant's identifier"),
-        ("survey" = Uuid, Path, description = "The survey's identifier"),
-        ("upload" = Uuid, Path, description = "The upload's identifier"),
+        UploadPath,
         ("tus-resumable" = String, Header, pattern = "^1\\.0\\.0$", description = "`1.0.0`"),
         ("upload-offset" = u64, Header, description = "Where these bytes begin"),
         ("upload-checksum" = Option<String>, Header, description = "Algorithm and digest in base64")
@@ -56,31 +51,26 @@ const STEP: u64 = 8 << 20;
 )]
 pub async fn patch(
     State(state): State<AppState>,
-    ApiPath((plant, survey, id)): ApiPath<(PlantId, SurveyId, UploadId)>,
+    ApiPath(path): ApiPath<UploadPath>,
     headers: HeaderMap,
     body: Body,
 ) -> Response {
-    answer(add(&state, plant, survey, id, &headers, body).await)
+    answer(add(&state, &path, &headers, body).await)
 }
 
 pub(super) async fn add(
     state: &AppState,
-    plant: PlantId,
-    survey: SurveyId,
-    id: UploadId,
+    path: &UploadPath,
     headers: &HeaderMap,
     body: Body,
 ) -> Result<Response, ApiError> {
-    state.require_survey(plant, survey).await?;
-    require_version(headers)?;
+    let (taken, mut upload) = take(state, path, headers).await?;
     if text(headers, "content-type")? != Some("application/offset+octet-stream") {
         let what = "send the bytes with the header `content-type: application/offset+octet-stream`";
         return Err(ApiError::new(Code::UnsupportedMediaType, what));
     }
     let offset = number(headers, "upload-offset")?;
     let checksum = text(headers, "upload-checksum")?.map(Checksum::parse).transpose()?;
-    let taken = state.desk.take(id).await?;
-    let mut upload = require_upload(state, survey, id).await?;
     if offset != upload.received {
         let what =
             format!("{} bytes are safe, and these begin at {offset}: ask with HEAD where to go on", upload.received);
@@ -88,7 +78,7 @@ pub(super) async fn add(
     }
     receive(state, &mut upload, body.into_data_stream(), checksum, &taken.interrupt).await?;
     if upload.received == upload.length {
-        finish(state, plant, &upload).await?;
+        finish(state, path.plant, &upload).await?;
     }
     let headers = [(UPLOAD_OFFSET, upload.received.to_string()), (UPLOAD_EXPIRES, http_date(upload.expires))];
     Ok((StatusCode::NO_CONTENT, headers).into_response())

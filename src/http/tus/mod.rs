@@ -26,13 +26,29 @@ use axum::body::Body;
 use axum::extract::State;
 use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
 use axum::response::{IntoResponse, Response};
+use desk::Taken;
 use finish::{finish, remove};
 use jiff::{SignedDuration, Timestamp};
 use protocol::{ALGORITHMS, EXTENSIONS, UPLOAD_EXPIRES, UPLOAD_OFFSET, VERSION, answer, http_date, require_version};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// How long an upload lives after its last byte.
 const LIFE: SignedDuration = SignedDuration::from_hours(24);
+
+/// Where an upload is asked about.
+#[derive(Debug, Deserialize, utoipa::IntoParams)]
+#[into_params(parameter_in = Path)]
+pub struct UploadPath {
+    /// The plant's identifier
+    #[param(value_type = Uuid)]
+    plant: PlantId,
+    /// The survey's identifier
+    #[param(value_type = Uuid)]
+    survey: SurveyId,
+    /// The upload's identifier
+    #[param(value_type = Uuid)]
+    upload: UploadId,
+}
 
 /// How an upload stands.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
@@ -52,7 +68,7 @@ pub struct UploadView {
 }
 
 /// What became of a whole file: stored, or refused.
-#[derive(Debug, Serialize, serde::Deserialize, utoipa::ToSchema)]
+#[derive(Debug, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Outcome {
     /// The files that it was, one but for an archive.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -66,6 +82,14 @@ pub struct Outcome {
 
 fn place(plant: PlantId, survey: SurveyId, id: UploadId) -> String {
     format!("/api/v1/plants/{plant}/surveys/{survey}/uploads/{id}")
+}
+
+/// An upload that a request to its own address is about, in the hands of this request.
+async fn take(state: &AppState, path: &UploadPath, headers: &HeaderMap) -> Result<(Taken, Upload), ApiError> {
+    state.require_survey(path.plant, path.survey).await?;
+    require_version(headers)?;
+    let taken = state.desk.take(path.upload).await?;
+    Ok((taken, require_upload(state, path.survey, path.upload).await?))
 }
 
 async fn require_upload(state: &AppState, survey: SurveyId, id: UploadId) -> Result<Upload, ApiError> {
@@ -113,9 +137,7 @@ pub async fn options(State(state): State<AppState>, _place: ApiPath<(PlantId, Su
     tag = "surveys",
     security(("key" = ["upload"])),
     params(
-        ("plant" = Uuid, Path, description = "The plant's identifier"),
-        ("survey" = Uuid, Path, description = "The survey's identifier"),
-        ("upload" = Uuid, Path, description = "The upload's identifier"),
+        UploadPath,
         ("tus-resumable" = String, Header, pattern = "^1\\.0\\.0$", description = "`1.0.0`")
     ),
     responses(
@@ -125,27 +147,14 @@ pub async fn options(State(state): State<AppState>, _place: ApiPath<(PlantId, Su
             `tus_version`")
     )
 )]
-pub async fn head(
-    State(state): State<AppState>,
-    ApiPath((plant, survey, id)): ApiPath<(PlantId, SurveyId, UploadId)>,
-    headers: HeaderMap,
-) -> Response {
-    answer(tell(&state, plant, survey, id, &headers).await)
+pub async fn head(State(state): State<AppState>, ApiPath(path): ApiPath<UploadPath>, headers: HeaderMap) -> Response {
+    answer(tell(&state, &path, &headers).await)
 }
 
-async fn tell(
-    state: &AppState,
-    plant: PlantId,
-    survey: SurveyId,
-    id: UploadId,
-    headers: &HeaderMap,
-) -> Result<Response, ApiError> {
-    state.require_survey(plant, survey).await?;
-    require_version(headers)?;
-    let _taken = state.desk.take(id).await?;
-    let upload = require_upload(state, survey, id).await?;
+async fn tell(state: &AppState, path: &UploadPath, headers: &HeaderMap) -> Result<Response, ApiError> {
+    let (_taken, upload) = take(state, path, headers).await?;
     if upload.received == upload.length {
-        finish(state, plant, &upload).await?;
+        finish(state, path.plant, &upload).await?;
     }
     let mut answer = HeaderMap::new();
     answer.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
@@ -170,11 +179,7 @@ async fn tell(
     path = "/api/v1/plants/{plant}/surveys/{survey}/uploads/{upload}",
     tag = "surveys",
     security(("key" = ["read"]), ("key" = ["review"]), ("key" = ["upload"])),
-    params(
-        ("plant" = Uuid, Path, description = "The plant's identifier"),
-        ("survey" = Uuid, Path, description = "The survey's identifier"),
-        ("upload" = Uuid, Path, description = "The upload's identifier")
-    ),
+    params(UploadPath),
     responses(
         (status = 200, body = UploadView),
         (status = 404, description = "`plant_not_found`, `survey_not_found`, `upload_not_found`", body = Problem,
@@ -183,13 +188,13 @@ async fn tell(
 )]
 pub async fn get(
     State(state): State<AppState>,
-    ApiPath((plant, survey, id)): ApiPath<(PlantId, SurveyId, UploadId)>,
+    ApiPath(path): ApiPath<UploadPath>,
 ) -> Result<Json<UploadView>, ApiError> {
-    state.require_survey(plant, survey).await?;
-    let upload = require_upload(&state, survey, id).await?;
+    state.require_survey(path.plant, path.survey).await?;
+    let upload = require_upload(&state, path.survey, path.upload).await?;
     let outcome = upload.outcome.as_deref().map(serde_json::from_str).transpose();
     Ok(Json(UploadView {
-        id,
+        id: upload.id,
         length: upload.length,
         offset: upload.received,
         expires: upload.expires,
@@ -204,9 +209,7 @@ pub async fn get(
     tag = "surveys",
     security(("key" = ["upload"])),
     params(
-        ("plant" = Uuid, Path, description = "The plant's identifier"),
-        ("survey" = Uuid, Path, description = "The survey's identifier"),
-        ("upload" = Uuid, Path, description = "The upload's identifier"),
+        UploadPath,
         ("tus-resumable" = String, Header, pattern = "^1\\.0\\.0$", description = "`1.0.0`")
     ),
     responses(
@@ -217,25 +220,16 @@ pub async fn get(
 )]
 pub async fn terminate(
     State(state): State<AppState>,
-    ApiPath((plant, survey, id)): ApiPath<(PlantId, SurveyId, UploadId)>,
+    ApiPath(path): ApiPath<UploadPath>,
     headers: HeaderMap,
 ) -> Response {
-    answer(end(&state, plant, survey, id, &headers).await)
+    answer(end(&state, &path, &headers).await)
 }
 
-async fn end(
-    state: &AppState,
-    plant: PlantId,
-    survey: SurveyId,
-    id: UploadId,
-    headers: &HeaderMap,
-) -> Result<Response, ApiError> {
-    state.require_survey(plant, survey).await?;
-    require_version(headers)?;
-    let _taken = state.desk.take(id).await?;
-    require_upload(state, survey, id).await?;
-    state.store.delete_upload(survey, id).await?;
-    remove(&state.blobs.upload_file(id)).await;
+async fn end(state: &AppState, path: &UploadPath, headers: &HeaderMap) -> Result<Response, ApiError> {
+    let (_taken, upload) = take(state, path, headers).await?;
+    state.store.delete_upload(path.survey, upload.id).await?;
+    remove(&state.blobs.upload_file(upload.id)).await;
     Ok(StatusCode::NO_CONTENT.into_response())
 }
 
@@ -246,9 +240,7 @@ async fn end(
     tag = "surveys",
     security(("key" = ["upload"])),
     params(
-        ("plant" = Uuid, Path, description = "The plant's identifier"),
-        ("survey" = Uuid, Path, description = "The survey's identifier"),
-        ("upload" = Uuid, Path, description = "The upload's identifier"),
+        UploadPath,
         ("x-http-method-override" = String, Header, pattern = "^(PATCH|DELETE)$", description = "`PATCH` or `DELETE`")
     ),
     request_body(content = Vec<u8>, content_type = "application/offset+octet-stream", description = "The bytes"),
@@ -260,14 +252,14 @@ async fn end(
 )]
 pub async fn post(
     State(state): State<AppState>,
-    ApiPath((plant, survey, id)): ApiPath<(PlantId, SurveyId, UploadId)>,
+    ApiPath(path): ApiPath<UploadPath>,
     headers: HeaderMap,
     body: Body,
 ) -> Response {
     let method = headers.get("x-http-method-override").and_then(|value| Method::from_bytes(value.as_bytes()).ok());
     answer(match method {
-        Some(Method::PATCH) => append::add(&state, plant, survey, id, &headers, body).await,
-        Some(Method::DELETE) => end(&state, plant, survey, id, &headers).await,
+        Some(Method::PATCH) => append::add(&state, &path, &headers, body).await,
+        Some(Method::DELETE) => end(&state, &path, &headers).await,
         _ => Err(ApiError::new(Code::MethodNotAllowed, "send PATCH, or the header `X-HTTP-Method-Override: PATCH`")),
     })
 }
