@@ -31,6 +31,8 @@ const LIKELY: f64 = 2.5;
 const DIFFERENT_COST: f64 = 2.0 * END_COST + 2.0;
 /// Cost of a shift that positions do not allow.
 const FAR_COST: f64 = 12.0;
+/// Share of the greatest displacement that is looked for, above which shifts are looked for about the one that is known.
+const DISPLACED: f64 = 0.25;
 /// Cost of two pieces of one image, with a gap between them that is no whole number of modules, in one bench.
 const GAP_COST: f64 = 12.0;
 /// Degrees of freedom of the positions' errors: few, for local errors of structure from motion have long tails.
@@ -167,7 +169,8 @@ pub struct Clusters {
 /// Finds the benches.
 pub fn associate(pieces: &[LocatedPiece], options: &FusionOptions) -> Clusters {
     let near = near_pairs(pieces, options);
-    let pairs: Vec<Pair> = near.par_iter().filter_map(|&(a, b)| pair(a, b, pieces, options)).collect();
+    let mut pairs: Vec<Pair> =
+        near.par_iter().filter_map(|&(a, b)| pair(a, b, pieces, Vector2::zeros(), options)).collect();
     let facing: Vec<Facing> = near.par_iter().filter_map(|&(a, b)| facing(a, b, pieces)).collect();
     let apart: Vec<Link> = facing.iter().filter_map(gap_between).collect();
     let views = pieces.iter().map(|piece| piece.view + 1).max().unwrap_or(0);
@@ -181,6 +184,7 @@ pub fn associate(pieces: &[LocatedPiece], options: &FusionOptions) -> Clusters {
     }
     let mut outcome = None;
     for _ in 0..2 {
+        look_about(&mut pairs, &field, pieces, options);
         let mut links: Vec<Link> = pairs
             .par_iter()
             .enumerate()
@@ -203,6 +207,19 @@ pub fn associate(pieces: &[LocatedPiece], options: &FusionOptions) -> Clusters {
             doubts: Vec::new(),
         },
     }
+}
+
+/// Looks for shifts of pieces about the displacement that is known of their views, where it is large.
+fn look_about(pairs: &mut [Pair], field: &DisparityField, pieces: &[LocatedPiece], options: &FusionOptions) {
+    pairs.par_iter_mut().enumerate().for_each(|(k, known)| {
+        let views = (pieces[known.a].view, pieces[known.b].view);
+        let (expected_m, _) = field.expected(k, views, known.at_m);
+        if expected_m.norm() > DISPLACED * options.max_disparity_m
+            && let Some(wider) = pair(known.a, known.b, pieces, expected_m, options)
+        {
+            *known = wider;
+        }
+    });
 }
 
 /// What the pairs with a known shift, under which they share modules, say of the displacements of their views.
@@ -408,8 +425,15 @@ struct CellShift {
     at_m: Vector2<f64>,
 }
 
-/// The shifts that are possible between two pieces of different views, or `None` if there is none.
-fn pair(a: usize, b: usize, pieces: &[LocatedPiece], options: &FusionOptions) -> Option<Pair> {
+/// The shifts that are possible between two pieces of different views, or `None` if there is none: those that displace them
+/// little against each other, or nearly as is expected of their views.
+fn pair(
+    a: usize,
+    b: usize,
+    pieces: &[LocatedPiece],
+    expected_m: Vector2<f64>,
+    options: &FusionOptions,
+) -> Option<Pair> {
     let (first, second) = (&pieces[a], &pieces[b]);
     if first.view == second.view {
         return None;
@@ -455,12 +479,18 @@ fn pair(a: usize, b: usize, pieces: &[LocatedPiece], options: &FusionOptions) ->
     let at_m = shifts.iter().map(|s| s.at_m).sum::<Vector2<f64>>() / shifts.len() as f64;
     let (col_reach, row_reach) =
         (options.max_disparity_m / other_u.norm(), (options.max_disparity_m / other_v.norm()).max(0.5));
+    // The expected displacement in columns and rows.
+    let area = other_u.perp(&other_v);
+    let expected = [expected_m.perp(&other_v) / area, other_u.perp(&expected_m) / area];
+    let range = |shift: f64, reach: f64, expected: f64| {
+        (shift + expected.min(0.0) - reach).ceil() as i32..=(shift + expected.max(0.0) + reach).floor() as i32
+    };
     let mut hypotheses = Vec::new();
-    for col in (col_shift - col_reach).ceil() as i32..=(col_shift + col_reach).floor() as i32 {
-        for row in (row_shift - row_reach).ceil() as i32..=(row_shift + row_reach).floor() as i32 {
+    for col in range(col_shift, col_reach, expected[0]) {
+        for row in range(row_shift, row_reach, expected[1]) {
             // The same cell by both: `b` sees it where `a` would be at the fractional rest of the shift.
             let disparity_m = other_u * (f64::from(col) - col_shift) + other_v * (f64::from(row) - row_shift);
-            if disparity_m.norm() > options.max_disparity_m {
+            if disparity_m.norm().min((disparity_m - expected_m).norm()) > options.max_disparity_m {
                 continue;
             }
             let (mut structure_cost, shares) = structure_cost(first, second, col, row, options);

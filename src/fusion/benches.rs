@@ -370,6 +370,8 @@ pub(super) fn without_ghosts(
                 benches: Vec::new(),
                 places_m: vec![bench.middle_m.xy()],
             };
+            // What was said of places inside of it says nothing of the model.
+            doubts.retain(|said| said.clusters != [bench.cluster]);
             doubts.push(OpenDoubt { doubt, clusters });
         }
     }

@@ -47,7 +47,7 @@ pub struct LocatedPiece {
     pub bridges: Vec<i32>,
     /// Lattice coordinates (column, row) to east and north, metres.
     pub ground: LatticeMap,
-    /// How well the cloud tells where the piece stands, one standard deviation, metres.
+    /// How well the cloud tells where the piece stands, one standard deviation in the horizontal plane, metres.
     pub sigma_m: f64,
 }
 
@@ -401,11 +401,11 @@ fn located_piece(
     located
 }
 
-/// Standard deviation of a piece's place by the scatter of the cloud about its surface, and by how much of it has points
-/// at all, metres.
+/// Standard deviation of a piece's place in the horizontal plane by the scatter of the cloud about its surface, and by how
+/// much of it has points at all, metres. The cloud scatters along the rays, which are steep: of that little is horizontal.
 fn cloud_sigma_m(cells: &[LocatedCell]) -> f64 {
     let mut scatter: Vec<f64> =
-        cells.iter().filter_map(|cell| Some((cell.cloud_m? - cell.position_m).norm())).collect();
+        cells.iter().filter_map(|cell| Some((cell.cloud_m? - cell.position_m).xy().norm())).collect();
     if scatter.is_empty() {
         return 0.5;
     }
