@@ -5,9 +5,9 @@ use crate::fusion::Fused;
 
 /// Seam between two modules that clamps hold, and its standard deviation, metres.
 const SEAM_M: f64 = 0.02;
-const SEAM_SIGMA_M: f64 = 0.004;
+const SEAM_SIGMA_M: f64 = 0.003;
 /// Standard deviation of the size of boxes, as a share.
-const BOX_SIGMA: f64 = 0.01;
+const BOX_SIGMA: f64 = 0.015;
 /// Pitch and boxes contradict each other beyond this share.
 const CONTRADICTION: f64 = 0.015;
 
