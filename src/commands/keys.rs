@@ -48,14 +48,14 @@ pub fn run(args: KeysArgs) -> anyhow::Result<()> {
             }
             KeysCommand::Revoke { id } => {
                 let key = key_of_any(&*store, id).await?;
-                store.revoke_key(key.organisation, id, now).await?;
+                store.revoke_key(key.organisation, id, None, now).await?;
                 eprintln!("key {id} ({}) opens nothing any more", key.name);
             }
             KeysCommand::Rotate { id, grace_hours } => {
                 let key = key_of_any(&*store, id).await?;
                 let secret = Secret::random()?;
                 let until = now + SignedDuration::from_hours(i64::from(grace_hours));
-                let rotated = store.rotate_key(key.organisation, id, &secret.record(), until).await?;
+                let rotated = store.rotate_key(key.organisation, id, None, &secret.record(), until).await?;
                 rotated.with_context(|| format!("key {id} is revoked; make another with `heliomap keys create`"))?;
                 eprintln!("key {id} ({}) has a new secret, which is shown this once:", key.name);
                 println!("{}", secret.reveal());

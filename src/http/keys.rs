@@ -1,6 +1,7 @@
 //! Keys and the audit log of the caller's organisation.
 
 use super::AppState;
+use super::conditional;
 use super::error::{ApiError, Code, Problem};
 use super::extract::{ApiJson, ApiPath, ApiQuery};
 use super::guard::Caller;
@@ -10,7 +11,7 @@ use crate::plant::PlantId;
 use crate::store::{ApiKey, AuditEntry, KeyId, NewKey, Scope, Secret, TimeSpan};
 use axum::Json;
 use axum::extract::State;
-use axum::http::{StatusCode, header};
+use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use jiff::{SignedDuration, Timestamp};
 use serde::{Deserialize, Serialize};
@@ -129,6 +130,28 @@ fn no_key(id: KeyId) -> ApiError {
     ApiError::new(Code::KeyNotFound, format!("no key has the identifier {id}; GET /api/v1/keys lists them"))
 }
 
+/// The key that a request changes, as the caller saw it, by the beginning of its secret; nothing where the request does not
+/// say which state of it is meant.
+async fn as_seen(
+    state: &AppState,
+    caller: &Caller,
+    id: KeyId,
+    headers: &HeaderMap,
+) -> Result<Option<String>, ApiError> {
+    if !conditional::is_asked(headers) {
+        return Ok(None);
+    }
+    let key = state.store.key(caller.organisation, id).await?.ok_or_else(|| no_key(id))?;
+    let prefix = key.prefix.clone();
+    conditional::require(headers, &KeyView::from(key))?;
+    Ok(Some(prefix))
+}
+
+/// What is said where a key is not there, or is not the one that was seen a moment before.
+fn not_as_seen(seen: Option<&str>, id: KeyId) -> ApiError {
+    if seen.is_some() { conditional::failed() } else { no_key(id) }
+}
+
 fn new_secret() -> Result<Secret, ApiError> {
     Secret::random().map_err(|error| ApiError::internal(&error))
 }
@@ -208,6 +231,8 @@ pub async fn list(
 }
 
 /// One key
+///
+/// Its tag changes with the time of its last use, too.
 #[utoipa::path(
     get,
     path = "/api/v1/keys/{key}",
@@ -235,9 +260,13 @@ pub async fn get(
     path = "/api/v1/keys/{key}",
     tag = "access",
     security(("key" = ["admin"])),
-    params(("key" = Uuid, Path, description = "The key's identifier")),
+    params(
+        ("key" = Uuid, Path, description = "The key's identifier"),
+        ("if-match" = Option<String>, Header, description = "Only as it was when it had one of these tags")
+    ),
     responses(
         (status = 200, description = "Revoked, now or before", body = KeyView),
+        (status = 412, description = "`precondition_failed`", body = Problem, content_type = "application/problem+json"),
         (status = 404, description = "`key_not_found`", body = Problem, content_type = "application/problem+json")
     )
 )]
@@ -245,10 +274,12 @@ pub async fn revoke(
     State(state): State<AppState>,
     caller: Caller,
     ApiPath(id): ApiPath<KeyId>,
+    headers: HeaderMap,
 ) -> Result<Json<KeyView>, ApiError> {
     caller.require_all_plants()?;
-    let key = state.store.revoke_key(caller.organisation, id, Timestamp::now()).await?.ok_or_else(|| no_key(id))?;
-    Ok(Json(key.into()))
+    let seen = as_seen(&state, &caller, id, &headers).await?;
+    let key = state.store.revoke_key(caller.organisation, id, seen.as_deref(), Timestamp::now()).await?;
+    Ok(Json(key.ok_or_else(|| not_as_seen(seen.as_deref(), id))?.into()))
 }
 
 /// Give a key a new secret
@@ -259,10 +290,14 @@ pub async fn revoke(
     path = "/api/v1/keys/{key}/rotate",
     tag = "access",
     security(("key" = ["admin"])),
-    params(("key" = Uuid, Path, description = "The key's identifier")),
+    params(
+        ("key" = Uuid, Path, description = "The key's identifier"),
+        ("if-match" = Option<String>, Header, description = "Only as it was when it had one of these tags")
+    ),
     request_body = RotateKey,
     responses(
         (status = 200, description = "The key with its new secret", body = KeyWithSecret),
+        (status = 412, description = "`precondition_failed`", body = Problem, content_type = "application/problem+json"),
         (status = "4XX", description = "`key_not_found` (a revoked one, too), `invalid_json`, `invalid_fields`, \
             `unsupported_media_type`, `too_large`", body = Problem, content_type = "application/problem+json")
     )
@@ -271,6 +306,7 @@ pub async fn rotate(
     State(state): State<AppState>,
     caller: Caller,
     ApiPath(id): ApiPath<KeyId>,
+    headers: HeaderMap,
     ApiJson(asked): ApiJson<RotateKey>,
 ) -> Result<Json<KeyWithSecret>, ApiError> {
     caller.require_all_plants()?;
@@ -278,10 +314,11 @@ pub async fn rotate(
     if grace > MAX_GRACE {
         return Err(ApiError::new(Code::InvalidFields, "grace_s is at most 2592000, 30 days"));
     }
+    let seen = as_seen(&state, &caller, id, &headers).await?;
     let secret = new_secret()?;
     let until = Timestamp::now() + grace;
-    let key = state.store.rotate_key(caller.organisation, id, &secret.record(), until).await?;
-    let key = key.ok_or_else(|| no_key(id))?;
+    let key = state.store.rotate_key(caller.organisation, id, seen.as_deref(), &secret.record(), until).await?;
+    let key = key.ok_or_else(|| not_as_seen(seen.as_deref(), id))?;
     Ok(Json(KeyWithSecret { secret: secret.reveal().to_owned(), key: key.into() }))
 }
 

@@ -1,6 +1,7 @@
 //! Webhooks: where the caller's organisation hears of the ends of its jobs, and what became of the messages.
 
 use super::AppState;
+use super::conditional;
 use super::error::{ApiError, Code, Problem};
 use super::extract::{ApiJson, ApiPath, ApiQuery};
 use super::guard::Caller;
@@ -10,7 +11,7 @@ use crate::store::webhooks::MAX_WEBHOOKS;
 use crate::store::{Delivery, DeliveryId, DeliveryState, JobId, NewWebhook, SigningSecret, Webhook, WebhookId};
 use axum::Json;
 use axum::extract::State;
-use axum::http::{StatusCode, header};
+use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -217,9 +218,13 @@ pub async fn get(
     path = "/api/v1/webhooks/{webhook}",
     tag = "webhooks",
     security(("key" = ["admin"])),
-    params(("webhook" = Uuid, Path, description = "The webhook's identifier")),
+    params(
+        ("webhook" = Uuid, Path, description = "The webhook's identifier"),
+        ("if-match" = Option<String>, Header, description = "Only as it was when it had one of these tags")
+    ),
     responses(
         (status = 204, description = "It is told of nothing any more"),
+        (status = 412, description = "`precondition_failed`", body = Problem, content_type = "application/problem+json"),
         (status = 404, description = "`webhook_not_found`", body = Problem, content_type = "application/problem+json")
     )
 )]
@@ -227,7 +232,11 @@ pub async fn delete(
     State(state): State<AppState>,
     caller: Caller,
     ApiPath(id): ApiPath<WebhookId>,
+    headers: HeaderMap,
 ) -> Result<StatusCode, ApiError> {
+    if conditional::is_asked(&headers) {
+        conditional::require(&headers, &WebhookView::from(require_webhook(&state, &caller, id).await?))?;
+    }
     caller.require_all_plants()?;
     match state.store.delete_webhook(caller.organisation, id).await? {
         true => Ok(StatusCode::NO_CONTENT),

@@ -163,18 +163,21 @@ pub trait AccessStore: Send + Sync + 'static {
     ) -> Result<Vec<ApiKey>, StoreError>;
     /// The key with this secret that is good now.
     async fn key_of_secret(&self, sha256: Digest, now: Timestamp) -> Result<Option<ApiKey>, StoreError>;
-    /// Makes a key good for nothing, for ever.
+    /// Makes a key good for nothing, for ever; where it is said, only while its secret is the one that begins so.
     async fn revoke_key(
         &self,
         organisation: OrganisationId,
         id: KeyId,
+        prefix: Option<&str>,
         now: Timestamp,
     ) -> Result<Option<ApiKey>, StoreError>;
-    /// Gives a key that is not revoked a new secret; the one before stays good until a time.
+    /// Gives a key that is not revoked a new secret, where it is said only while its secret is the one that begins so; the
+    /// one before stays good until a time.
     async fn rotate_key(
         &self,
         organisation: OrganisationId,
         id: KeyId,
+        prefix: Option<&str>,
         secret: &SecretRecord,
         previous_until: Timestamp,
     ) -> Result<Option<ApiKey>, StoreError>;

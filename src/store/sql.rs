@@ -96,12 +96,13 @@ pub const KEY_OF_SECRET: &str = concat!(
      AND revoked_ms IS NULL AND (expires_ms IS NULL OR expires_ms > $2)"
 );
 pub const REVOKE_KEY: &str = concat!(
-    "UPDATE api_keys SET revoked_ms = COALESCE(revoked_ms, $3) WHERE organisation_id = $1 AND id = $2 RETURNING ",
+    "UPDATE api_keys SET revoked_ms = COALESCE(revoked_ms, $3) WHERE organisation_id = $1 AND id = $2 \
+     AND prefix = COALESCE($4, prefix) RETURNING ",
     key!()
 );
 pub const ROTATE_KEY: &str = concat!(
     "UPDATE api_keys SET previous_sha256 = sha256, previous_until_ms = $5, prefix = $3, sha256 = $4 \
-     WHERE organisation_id = $1 AND id = $2 AND revoked_ms IS NULL RETURNING ",
+     WHERE organisation_id = $1 AND id = $2 AND revoked_ms IS NULL AND prefix = COALESCE($6, prefix) RETURNING ",
     key!()
 );
 pub const KEY_USED: &str = "UPDATE api_keys SET last_used_ms = $2 WHERE id = $1";

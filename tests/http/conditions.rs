@@ -53,6 +53,45 @@ async fn a_plant_is_deleted_as_it_was_seen() {
 }
 
 #[tokio::test]
+async fn keys_and_webhooks_are_changed_as_they_were_seen() {
+    let app = App::new(&[]).await;
+    let tag = async |path: &str| {
+        let answer = app.request(Method::GET, path).send().await.unwrap();
+        answer.headers()["etag"].to_str().unwrap().to_owned()
+    };
+    let send = async |method: Method, path: &str, tag: &str| {
+        let request = app.request(method, path).header("if-match", tag);
+        json_of(request.json(&json!({})).send().await.unwrap()).await
+    };
+    let (_, key) = app.post("/api/v1/keys", json!({"name": "station", "scopes": ["upload"]})).await;
+    let key = format!("/api/v1/keys/{}", key["id"].as_str().unwrap());
+    let rotate = format!("{key}/rotate");
+    assert_problem(send(Method::POST, &rotate, "\"other\"").await, 412, "precondition_failed", "decide anew");
+    // Of two administrators who saw the same key, one gives it a new secret, and the other hears of it.
+    let first = tag(&key).await;
+    assert_eq!(send(Method::POST, &rotate, &first).await.0, StatusCode::OK);
+    let before = app.get(&key).await.1;
+    for (method, path) in [(Method::POST, &rotate), (Method::DELETE, &key)] {
+        assert_problem(send(method, path, &first).await, 412, "precondition_failed", "decide anew");
+    }
+    assert_eq!(app.get(&key).await.1, before);
+    let second = tag(&key).await;
+    let (status, revoked) = send(Method::DELETE, &key, &format!("\"other\", {second}")).await;
+    assert_eq!((status, revoked["revoked"].is_string()), (StatusCode::OK, true), "{revoked}");
+    assert_problem(send(Method::DELETE, &key, &second).await, 412, "precondition_failed", "decide anew");
+    assert_eq!(send(Method::DELETE, &key, "*").await.0, StatusCode::OK);
+    let absent = "/api/v1/keys/00000000-0000-4000-8000-000000000000";
+    assert_problem(send(Method::DELETE, absent, "*").await, 404, "key_not_found", "");
+
+    let (_, hook) = app.post("/api/v1/webhooks", json!({"url": "https://example.org/"})).await;
+    let hook = format!("/api/v1/webhooks/{}", hook["id"].as_str().unwrap());
+    assert_problem(send(Method::DELETE, &hook, "\"other\"").await, 412, "precondition_failed", "decide anew");
+    assert_eq!(app.get(&hook).await.0, StatusCode::OK);
+    assert_eq!(send(Method::DELETE, &hook, &tag(&hook).await).await.0, StatusCode::NO_CONTENT);
+    assert_problem(send(Method::DELETE, &hook, "*").await, 404, "webhook_not_found", "");
+}
+
+#[tokio::test]
 async fn lists_are_filtered_and_go_on_so() {
     let app = App::new(&[Act::Map(1), Act::RefuseInput]).await;
     let survey = app.complete_survey().await;

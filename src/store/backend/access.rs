@@ -86,16 +86,22 @@ impl AccessStore for Rows {
         &self,
         organisation: OrganisationId,
         id: KeyId,
+        prefix: Option<&str>,
         now: Timestamp,
     ) -> Result<Option<ApiKey>, StoreError> {
-        let query = sqlx::query(sql::REVOKE_KEY).bind(organisation.to_string()).bind(id.to_string());
-        query.bind(now.as_millisecond()).fetch_optional(&self.write).await?.as_ref().map(key).transpose()
+        let query = sqlx::query(sql::REVOKE_KEY)
+            .bind(organisation.to_string())
+            .bind(id.to_string())
+            .bind(now.as_millisecond())
+            .bind(prefix);
+        query.fetch_optional(&self.write).await?.as_ref().map(key).transpose()
     }
 
     async fn rotate_key(
         &self,
         organisation: OrganisationId,
         id: KeyId,
+        prefix: Option<&str>,
         secret: &SecretRecord,
         previous_until: Timestamp,
     ) -> Result<Option<ApiKey>, StoreError> {
@@ -105,6 +111,7 @@ impl AccessStore for Rows {
             .bind(&secret.prefix)
             .bind(secret.sha256.to_string())
             .bind(previous_until.as_millisecond())
+            .bind(prefix)
             .fetch_optional(&self.write)
             .await?;
         row.as_ref().map(key).transpose()

@@ -74,17 +74,20 @@ pub async fn keys(store: &dyn Store) {
     assert_eq!(store.keys(None, TimeSpan::default(), Page { after: Some(key.seq), limit: 9 }).await.unwrap().len(), 1);
     assert!(store.keys(Some(b), TimeSpan::default(), ALL).await.unwrap().is_empty());
 
-    assert!(store.rotate_key(b, key.id, &secret("two"), at(20)).await.unwrap().is_none());
-    let rotated = store.rotate_key(a, key.id, &secret("two"), at(20)).await.unwrap().unwrap();
+    assert!(store.rotate_key(b, key.id, None, &secret("two"), at(20)).await.unwrap().is_none());
+    let rotated = store.rotate_key(a, key.id, None, &secret("two"), at(20)).await.unwrap().unwrap();
     assert_eq!(rotated.prefix, "two");
+    // Whoever knows it by the secret of before neither rotates nor revokes it.
+    assert!(store.rotate_key(a, key.id, Some("one"), &secret("four"), at(20)).await.unwrap().is_none());
+    assert!(store.revoke_key(a, key.id, Some("one"), at(20)).await.unwrap().is_none());
     assert_eq!((found("one", 19).await, found("one", 20).await), (Some(key.id), None));
     assert_eq!(found("two", 50).await, Some(key.id));
-    assert!(store.revoke_key(b, key.id, at(30)).await.unwrap().is_none());
-    assert_eq!(store.revoke_key(a, key.id, at(30)).await.unwrap().unwrap().revoked, Some(at(30)));
-    assert_eq!(store.revoke_key(a, key.id, at(40)).await.unwrap().unwrap().revoked, Some(at(30)));
+    assert!(store.revoke_key(b, key.id, None, at(30)).await.unwrap().is_none());
+    assert_eq!(store.revoke_key(a, key.id, Some("two"), at(30)).await.unwrap().unwrap().revoked, Some(at(30)));
+    assert_eq!(store.revoke_key(a, key.id, None, at(40)).await.unwrap().unwrap().revoked, Some(at(30)));
     assert_eq!((found("one", 10).await, found("two", 10).await), (None, None));
-    assert!(store.rotate_key(a, key.id, &secret("three"), at(50)).await.unwrap().is_none());
-    assert!(store.revoke_key(a, KeyId(Uuid::nil()), at(30)).await.unwrap().is_none());
+    assert!(store.rotate_key(a, key.id, None, &secret("three"), at(50)).await.unwrap().is_none());
+    assert!(store.revoke_key(a, KeyId(Uuid::nil()), None, at(30)).await.unwrap().is_none());
 }
 
 pub async fn audit_log(store: &dyn Store) {
