@@ -89,6 +89,95 @@ async fn what_came_before_the_line_broke_counts() {
     assert_eq!(app.get(&survey).await.1["files"][0]["sha256"], Digest::of(&photo).to_string());
 }
 
+/// A request that brings `first`, and `rest` once it is told to; nothing more where it never is.
+fn brings_more_later(
+    app: &App,
+    upload: &str,
+    [first, rest]: [Vec<u8>; 2],
+    headers: Vec<(&'static str, String)>,
+) -> (tokio::sync::oneshot::Sender<()>, tokio::task::JoinHandle<Response>) {
+    let (go_on, told) = tokio::sync::oneshot::channel::<()>();
+    let rest = async move { if told.await.is_ok() { Ok(rest) } else { std::future::pending().await } };
+    let pieces = futures::stream::once(async { Ok::<_, std::io::Error>(first) }).chain(futures::stream::once(rest));
+    let request = tus(app, Method::PATCH, upload).header("upload-offset", 0);
+    let request = request.header("content-type", "application/offset+octet-stream");
+    let request = headers.into_iter().fold(request, |request, (name, value)| request.header(name, value));
+    let request = request.body(reqwest::Body::wrap_stream(pieces));
+    (go_on, tokio::spawn(async move { request.send().await.unwrap() }))
+}
+
+/// Waits until some of an upload's bytes are on disk.
+async fn some_came(app: &App, upload: &str) {
+    let file = app.folder.path().join("uploads").join(upload.rsplit('/').next().unwrap());
+    for _ in 0..24_000 {
+        if std::fs::metadata(&file).unwrap().len() > 0 {
+            return;
+        }
+        tokio::time::sleep(std::time::Duration::from_millis(5)).await;
+    }
+    panic!("nothing comes");
+}
+
+/// A reconstruction of a megabyte, in two pieces.
+fn large() -> [Vec<u8>; 2] {
+    let document = format!("[{{\"shots\": {{}}}}]{}", " ".repeat(1 << 20)).into_bytes();
+    let (first, rest) = document.split_at(600_000);
+    [first.to_vec(), rest.to_vec()]
+}
+
+#[tokio::test]
+async fn a_request_with_wrong_headers_leaves_a_running_one_alone() {
+    let app = App::new(&[]).await;
+    let survey = app.survey().await;
+    let pieces = large();
+    let length = pieces[0].len() + pieces[1].len();
+    let upload = begin(&app, &survey, length, &metadata("path", "reconstruction.json")).await;
+    let (go_on, running) = brings_more_later(&app, &upload, pieces, Vec::new());
+    some_came(&app, &upload).await;
+
+    let more = |offset: &'static str| {
+        let request = app.request(Method::PATCH, &upload).header("upload-offset", offset).body("abc");
+        request.header("content-type", "application/offset+octet-stream")
+    };
+    let with = |request: RequestBuilder| request.header("tus-resumable", "1.0.0").send();
+    let typeless = tus(&app, Method::PATCH, &upload).header("upload-offset", "0").body("abc").send();
+    assert_problem(problem(typeless.await.unwrap()).await, 415, "unsupported_media_type", "offset+octet-stream");
+    assert_problem(problem(more("0").send().await.unwrap()).await, 412, "tus_version", "");
+    for (offset, status, code) in [("5", 409, "upload_offset"), ("-1", 400, "bad_request")] {
+        assert_problem(problem(with(more(offset)).await.unwrap()).await, status, code, "");
+    }
+    for checksum in ["md5 AAAA", "sha256 AAAA", "sha1"] {
+        let wrong = more("0").header("upload-checksum", checksum);
+        assert_problem(problem(with(wrong).await.unwrap()).await, 400, "bad_request", "Upload-Checksum");
+    }
+    let too_much = with(more("0").body(vec![b' '; length + 1])).await.unwrap();
+    assert_problem(problem(too_much).await, 400, "bad_request", "were announced");
+    let post = app.request(Method::POST, &upload).header("x-http-method-override", "PATCH").body("abc");
+    assert_problem(problem(with(post).await.unwrap()).await, 415, "unsupported_media_type", "");
+
+    assert!(!running.is_finished());
+    go_on.send(()).unwrap();
+    assert_eq!(running.await.unwrap().status(), StatusCode::NO_CONTENT);
+    assert_eq!(app.get(&survey).await.1["files"][0]["size"], json!(length));
+}
+
+#[tokio::test]
+async fn a_request_with_the_right_headers_takes_the_upload_over() {
+    let app = App::new(&[]).await;
+    let survey = app.survey().await;
+    let pieces = large();
+    let whole = pieces.concat();
+    let upload = begin(&app, &survey, whole.len(), &metadata("path", "reconstruction.json")).await;
+    // Its old connection is still open, and what it brought counts only as a whole.
+    let sum = format!("sha256 {}", BASE64_STANDARD.encode(Digest::of(&whole).0));
+    let (go_on, running) = brings_more_later(&app, &upload, pieces, vec![("upload-checksum", sum)]);
+    some_came(&app, &upload).await;
+    assert_eq!(more(&app, &upload, 0, &whole).send().await.unwrap().status(), StatusCode::NO_CONTENT);
+    assert_problem(problem(running.await.unwrap()).await, 400, "upload_interrupted", "newer request");
+    drop(go_on);
+    assert_eq!(app.get(&survey).await.1["files"][0]["sha256"], Digest::of(&whole).to_string());
+}
+
 #[tokio::test]
 async fn checksums_are_checked() {
     let app = App::new(&[]).await;

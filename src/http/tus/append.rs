@@ -2,7 +2,7 @@
 
 use super::finish::finish;
 use super::protocol::{Checksum, UPLOAD_EXPIRES, UPLOAD_OFFSET, answer, http_date, number, text, wrong};
-use super::{LIFE, UploadPath, take};
+use super::{LIFE, UploadPath, found, take};
 use crate::http::AppState;
 use crate::http::error::{ApiError, Code, Problem};
 use crate::http::extract::ApiPath;
@@ -10,7 +10,7 @@ use crate::http::intake::disk;
 use crate::store::Upload;
 use axum::body::{Body, BodyDataStream};
 use axum::extract::State;
-use axum::http::{HeaderMap, StatusCode};
+use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use futures::StreamExt;
 use jiff::Timestamp;
@@ -64,24 +64,59 @@ pub(super) async fn add(
     headers: &HeaderMap,
     body: Body,
 ) -> Result<Response, ApiError> {
+    // All that can be wrong with a request is found before it takes the upload from one that is running.
+    let upload = found(state, path, headers).await?;
+    let announced = Announced::read(headers)?;
+    announced.require_fits(&upload)?;
+    // Whoever had it may have made more safe on the way out.
     let (taken, mut upload) = take(state, path, headers).await?;
-    if text(headers, "content-type")? != Some("application/offset+octet-stream") {
-        let what = "send the bytes with the header `content-type: application/offset+octet-stream`";
-        return Err(ApiError::new(Code::UnsupportedMediaType, what));
-    }
-    let offset = number(headers, "upload-offset")?;
-    let checksum = text(headers, "upload-checksum")?.map(Checksum::parse).transpose()?;
-    if offset != upload.received {
-        let what =
-            format!("{} bytes are safe, and these begin at {offset}: ask with HEAD where to go on", upload.received);
-        return Err(ApiError::new(Code::UploadOffset, what).with("offset", upload.received));
-    }
-    receive(state, &mut upload, body.into_data_stream(), checksum, &taken.interrupt).await?;
+    announced.require_fits(&upload)?;
+    receive(state, &mut upload, body.into_data_stream(), announced.checksum, &taken.interrupt).await?;
     if upload.received == upload.length {
         finish(state, path.plant, &upload).await?;
     }
     let headers = [(UPLOAD_OFFSET, upload.received.to_string()), (UPLOAD_EXPIRES, http_date(upload.expires))];
     Ok((StatusCode::NO_CONTENT, headers).into_response())
+}
+
+/// What a request says of the bytes that it brings.
+struct Announced {
+    offset: u64,
+    /// How many, where that is said.
+    length: Option<u64>,
+    checksum: Option<Checksum>,
+}
+
+impl Announced {
+    fn read(headers: &HeaderMap) -> Result<Self, ApiError> {
+        if text(headers, "content-type")? != Some("application/offset+octet-stream") {
+            let what = "send the bytes with the header `content-type: application/offset+octet-stream`";
+            return Err(ApiError::new(Code::UnsupportedMediaType, what));
+        }
+        Ok(Self {
+            offset: number(headers, "upload-offset")?,
+            length: headers.get(header::CONTENT_LENGTH).and_then(|value| value.to_str().ok()?.parse().ok()),
+            checksum: text(headers, "upload-checksum")?.map(Checksum::parse).transpose()?,
+        })
+    }
+
+    /// Refuses bytes that do not go on where an upload is, or go beyond its end.
+    fn require_fits(&self, upload: &Upload) -> Result<(), ApiError> {
+        let Upload { received, length, .. } = *upload;
+        if self.offset != received {
+            let what =
+                format!("{received} bytes are safe, and these begin at {}: ask with HEAD where to go on", self.offset);
+            return Err(ApiError::new(Code::UploadOffset, what).with("offset", received));
+        }
+        if self.length.is_some_and(|more| more > length - received) {
+            return Err(too_much(length));
+        }
+        Ok(())
+    }
+}
+
+fn too_much(length: u64) -> ApiError {
+    wrong(format!("there is more than the {length} bytes that were announced"))
 }
 
 /// Appends what comes to an upload's file, and says in `upload` how much of it is safe.
@@ -117,7 +152,7 @@ async fn receive(
             Err(_) => break Some(ApiError::new(Code::UploadStalled, "nothing came; ask with HEAD where to go on")),
         };
         if chunk.len() as u64 > upload.length - at {
-            break Some(wrong(format!("there is more than the {} bytes that were announced", upload.length)));
+            break Some(too_much(upload.length));
         }
         if let Some(checksum) = &mut checksum {
             checksum.update(&chunk);

@@ -84,10 +84,16 @@ fn place(plant: PlantId, survey: SurveyId, id: UploadId) -> String {
     format!("/api/v1/plants/{plant}/surveys/{survey}/uploads/{id}")
 }
 
-/// An upload that a request to its own address is about, in the hands of this request.
-async fn take(state: &AppState, path: &UploadPath, headers: &HeaderMap) -> Result<(Taken, Upload), ApiError> {
+/// An upload that a request to its own address is about.
+async fn found(state: &AppState, path: &UploadPath, headers: &HeaderMap) -> Result<Upload, ApiError> {
     state.require_survey(path.plant, path.survey).await?;
     require_version(headers)?;
+    require_upload(state, path.survey, path.upload).await
+}
+
+/// As [`found`], in the hands of this request: whichever had it before is interrupted.
+async fn take(state: &AppState, path: &UploadPath, headers: &HeaderMap) -> Result<(Taken, Upload), ApiError> {
+    found(state, path, headers).await?;
     let taken = state.desk.take(path.upload).await?;
     Ok((taken, require_upload(state, path.survey, path.upload).await?))
 }
