@@ -326,3 +326,18 @@ impl Worker {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_cancelled_job_ends_within_two_seconds_whatever_the_lease() {
+        for lease_s in [1, 30, 3600] {
+            let settings = WorkerSettings::with_lease(Duration::from_secs(lease_s));
+            // It is heard of at the next heartbeat, and a mapping that does not listen is left a moment later.
+            let latest = settings.heartbeat + LINGER;
+            assert!(latest <= Duration::from_millis(1500), "{latest:?} with a lease of {lease_s} s");
+        }
+    }
+}

@@ -208,7 +208,7 @@ pub struct App {
 /// A worker in a hurry.
 fn worker(store: Arc<dyn Store>, blobs: Blobs, mapper: Arc<dyn Mapper>) -> Worker {
     let settings = WorkerSettings {
-        lease: Duration::from_secs(60),
+        lease: Duration::from_secs(3600),
         heartbeat: Duration::from_millis(10),
         poll: Duration::from_millis(20),
         backoff: Duration::from_millis(10),

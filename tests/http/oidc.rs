@@ -15,12 +15,15 @@ use ring::signature::{
     ECDSA_P256_SHA256_FIXED_SIGNING, EcdsaKeyPair, Ed25519KeyPair, KeyPair, RSA_PKCS1_SHA256, RsaKeyPair,
 };
 use serde_json::{Value, json};
-use std::process::Command;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 const AUDIENCE: &str = "heliomap";
+
+/// RSA keys of 2048 bits, PKCS #8, made for these tests: they open nothing.
+const RSA_OF_PROVIDER: &[u8] = include_bytes!("../fixtures/oidc/rsa-provider.der");
+const RSA_OF_STRANGER: &[u8] = include_bytes!("../fixtures/oidc/rsa-stranger.der");
 
 enum Key {
     Rsa(RsaKeyPair),
@@ -33,14 +36,8 @@ fn b64(bytes: impl AsRef<[u8]>) -> String {
 }
 
 impl Key {
-    fn rsa() -> Self {
-        let made = Command::new("openssl")
-            .args(["genpkey", "-algorithm", "RSA", "-pkeyopt", "rsa_keygen_bits:2048", "-outform", "DER"])
-            .output()
-            .expect("openssl makes the provider's RSA key");
-        assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
-        // As PKCS #8 or, from some versions, as PKCS #1.
-        Self::Rsa(RsaKeyPair::from_pkcs8(&made.stdout).or_else(|_| RsaKeyPair::from_der(&made.stdout)).unwrap())
+    fn rsa(document: &[u8]) -> Self {
+        Self::Rsa(RsaKeyPair::from_pkcs8(document).unwrap())
     }
 
     fn ec() -> Self {
@@ -159,7 +156,7 @@ async fn ask(app: &App, token: &str) -> (StatusCode, Value) {
 
 #[tokio::test]
 async fn who_shows_a_good_token_is_let_in_as_its_claims_say() {
-    let keys = [Key::rsa(), Key::ec(), Key::ed()];
+    let keys = [Key::rsa(RSA_OF_PROVIDER), Key::ec(), Key::ed()];
     let provider = Provider::new(keys.iter().zip(["r", "e", "d"]).map(|(key, id)| key.jwk(id)).collect()).await;
     let app = App::with_oidc(provider.oidc(Duration::from_secs(60))).await;
     // There is no such organisation yet.
@@ -189,7 +186,7 @@ async fn who_shows_a_good_token_is_let_in_as_its_claims_say() {
 
 #[tokio::test]
 async fn every_other_token_lets_nobody_in() {
-    let (rsa, ec) = (Key::rsa(), Key::ec());
+    let (rsa, ec) = (Key::rsa(RSA_OF_PROVIDER), Key::ec());
     let provider = Provider::new(vec![rsa.jwk("r"), ec.jwk("e")]).await;
     let app = App::with_oidc(provider.oidc(Duration::from_secs(60))).await;
     app.key("owner", &[Scope::Admin], None).await;
@@ -240,7 +237,7 @@ async fn every_other_token_lets_nobody_in() {
         (forged("ES256", &|message| ec.sign(message)), "a key that the provider does not have"),
         (rsa.token("e", &good), "a key that the provider does not have"),
         (rsa.token("unknown", &good), "a key that the provider does not have"),
-        (Key::rsa().token("r", &good), "a signature that does not hold"),
+        (Key::rsa(RSA_OF_STRANGER).token("r", &good), "a signature that does not hold"),
         (changed, "the token"),
         ("a.b.c".to_owned(), "cannot be read"),
         (format!("{}.b.c", "a".repeat(20_000)), "longer than"),
