@@ -11,7 +11,8 @@ use std::time::Duration;
 
 use PostgresStore as Rows;
 use sqlx::postgres::PgRow as Row;
-type Tx = Transaction<'static, Postgres>;
+type Db = Postgres;
+type Tx = Transaction<'static, Db>;
 
 /// How long a statement waits for a connection.
 const ACQUIRE_TIMEOUT: Duration = Duration::from_secs(20);

@@ -376,9 +376,9 @@ pub const INSERT_MODEL: &str = concat!(
 pub const INSERT_LAYER: &str = "\
     INSERT INTO layers (model_seq, layer, features, properties, min_lon, min_lat, max_lon, max_lat, tallest_deg, \
     widest_deg) VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10)";
-pub const INSERT_FEATURE: &str = "\
-    INSERT INTO features (model_seq, layer, seq, id, label, feature, min_lon, min_lat, max_lon, max_lat, strip) \
-    VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11)";
+/// Rows follow, as many as one statement may have.
+pub const INSERT_FEATURES: &str =
+    "INSERT INTO features (model_seq, layer, seq, id, label, feature, min_lon, min_lat, max_lon, max_lat, strip) ";
 
 pub const MODELS: &str =
     concat!("SELECT ", model!(), " FROM models WHERE plant_id = $1 AND seq < $2 ORDER BY seq DESC LIMIT $3");

@@ -13,7 +13,8 @@ use std::time::Duration;
 
 use SqliteStore as Rows;
 use sqlx::sqlite::SqliteRow as Row;
-type Tx = Transaction<'static, Sqlite>;
+type Db = Sqlite;
+type Tx = Transaction<'static, Db>;
 
 /// How long a statement waits for another process's transaction.
 const BUSY_TIMEOUT: Duration = Duration::from_secs(20);

@@ -62,6 +62,7 @@ on_both!(
     deleted_plants_are_remembered,
     cancel,
     models_and_features,
+    large_models,
     two_models_of_one_version_are_not_written,
     a_deleted_plant_takes_everything_with_it,
     boxes_find_what_touches_them,

@@ -1,5 +1,5 @@
 //! The methods of the store, written once for both databases: this module is compiled once beside each of them and knows
-//! its database by the names `Rows` (the store), `Row` and `Tx` of its parent.
+//! its database by the names `Rows` (the store), `Db`, `Row` and `Tx` of its parent.
 
 mod access;
 pub mod examine;
@@ -17,18 +17,22 @@ use super::super::{
     NewModel, OrganisationId, Page, Plant, Pool, Progress, Queue, Quotas, Store, StoreError, Survey, SurveyId,
     SurveyPath, TaskStore, Wanted,
 };
-use super::{Row, Rows, Tx};
+use super::{Db, Row, Rows, Tx};
 use crate::plant::{Layer, ModuleId, PlantId};
 use async_trait::async_trait;
 use jiff::Timestamp;
 use read::{file, job, model, plant, survey};
-use sqlx::Row as _;
+use sqlx::{QueryBuilder, Row as _};
 use std::time::Duration;
 use uuid::Uuid;
 use webhooks::announce;
 
 /// A box that covers less of its layer than this is looked up by place.
 const SMALL_BOX_SHARE: f64 = 0.05;
+
+/// Features that one statement inserts. A row has eleven parameters, and SQLite takes 32,766 of them in one statement, Postgres
+/// 65,535.
+const FEATURES_AT_ONCE: usize = 500;
 
 #[async_trait]
 impl Store for Rows {
@@ -434,8 +438,10 @@ impl Store for Rows {
                 .bind(extents().map(GeoBox::width_deg).fold(0.0, f64::max))
                 .execute(&mut *tx)
                 .await?;
-            for (index, feature) in layer.features.iter().enumerate() {
-                insert_feature(&mut tx, stored.seq, layer.layer, index as i64 + 1, feature).await?;
+            let mut first = 1;
+            for features in layer.features.chunks(FEATURES_AT_ONCE) {
+                insert_features(&mut tx, stored.seq, layer.layer, first, features).await?;
+                first += features.len() as i64;
             }
         }
         sweep(&mut tx).await?;
@@ -624,27 +630,30 @@ async fn put_file(
     Ok((done.rows_affected() > 0).then_some(verdict))
 }
 
-async fn insert_feature(
+/// Inserts features that follow each other in a layer, the first with the sequence number `first`, by one statement.
+async fn insert_features(
     tx: &mut Tx,
     model_seq: i64,
     layer: Layer,
-    seq: i64,
-    feature: &NewFeature,
+    first: i64,
+    features: &[NewFeature],
 ) -> Result<(), StoreError> {
-    sqlx::query(sql::INSERT_FEATURE)
-        .bind(model_seq)
-        .bind(layer.as_str())
-        .bind(seq)
-        .bind(&feature.id)
-        .bind(&feature.label)
-        .bind(&feature.json)
-        .bind(feature.extent.map(|b| b.min_lon))
-        .bind(feature.extent.map(|b| b.min_lat))
-        .bind(feature.extent.map(|b| b.max_lon))
-        .bind(feature.extent.map(|b| b.max_lat))
-        .bind(feature.extent.map(|b| strip(b.min_lon)))
-        .execute(&mut **tx)
-        .await?;
+    let mut insert = QueryBuilder::<Db>::new(sql::INSERT_FEATURES);
+    insert.push_values((first..).zip(features), |mut row, (seq, feature)| {
+        row.push_bind(model_seq)
+            .push_bind(layer.as_str())
+            .push_bind(seq)
+            .push_bind(&feature.id)
+            .push_bind(&feature.label)
+            .push_bind(&feature.json)
+            .push_bind(feature.extent.map(|b| b.min_lon))
+            .push_bind(feature.extent.map(|b| b.min_lat))
+            .push_bind(feature.extent.map(|b| b.max_lon))
+            .push_bind(feature.extent.map(|b| b.max_lat))
+            .push_bind(feature.extent.map(|b| strip(b.min_lon)));
+    });
+    // The last rows of each layer are another number each time: no statement is kept for them.
+    insert.build().persistent(features.len() == FEATURES_AT_ONCE).execute(&mut **tx).await?;
     Ok(())
 }
 

@@ -42,6 +42,24 @@ pub async fn models_and_features(store: &dyn Store) {
     assert_eq!(store.module_last_seen(survey.plant, id(9)).await.unwrap(), None);
 }
 
+/// More features than one statement takes: all are there, once, in their order.
+pub async fn large_models(store: &dyn Store) {
+    let survey = survey(store, plant(store, "A").await.id, "June").await;
+    for (version, columns) in [(1, 1000), (2, 1234)] {
+        enqueue(store, &survey).await;
+        let claim = claim(store, 0).await.unwrap();
+        let stored = store.complete_job(&claim, &model(survey.plant, version, columns), at(1)).await.unwrap();
+        let Completed::Done(stored) = stored else { panic!("the claim holds") };
+        let layer = store.layer(&stored, Layer::Modules).await.unwrap().unwrap();
+        let all = store.features(&layer, FeatureQuery { after: None, limit: 5000, within: None }).await.unwrap();
+        let found: Vec<(i64, String)> = all.into_iter().map(|feature| (feature.seq, feature.json)).collect();
+        let expected = (0..columns).map(|c| (c as i64 + 1, format!("{{\"column\":{c},\"version\":{version}}}")));
+        assert_eq!(found, expected.collect::<Vec<_>>());
+        let last = store.module(&stored, ModuleId::from_serial(survey.plant, columns - 1)).await.unwrap();
+        assert!(last.is_some());
+    }
+}
+
 pub async fn two_models_of_one_version_are_not_written(store: &dyn Store) {
     let survey = survey(store, plant(store, "A").await.id, "June").await;
     enqueue(store, &survey).await;
