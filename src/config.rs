@@ -79,6 +79,8 @@ pub struct ServeArgs {
     #[command(flatten)]
     pub metrics: MetricsArgs,
     #[command(flatten)]
+    pub retention: RetentionArgs,
+    #[command(flatten)]
     pub limits: Limits,
 }
 
@@ -126,11 +128,22 @@ pub struct WorkerArgs {
     #[command(flatten)]
     pub metrics: MetricsArgs,
     #[command(flatten)]
+    pub retention: RetentionArgs,
+    #[command(flatten)]
     pub storage: StorageArgs,
     #[command(flatten)]
     pub detector: DetectorArgs,
     #[command(flatten)]
     pub jobs: JobArgs,
+}
+
+/// How long what nothing needs any more is kept.
+#[derive(Debug, Clone, Args)]
+pub struct RetentionArgs {
+    /// Seconds for which the bytes of a file that was replaced are kept where nothing else needs them. No backup may take
+    /// longer.
+    #[arg(long, env = "HELIOMAP_KEEP_REPLACED", default_value = "86400", value_parser = parse_seconds, value_name = "SECONDS")]
+    pub keep_replaced: Duration,
 }
 
 /// How jobs are run.

@@ -14,9 +14,10 @@ pub mod serve;
 pub mod worker;
 
 use anyhow::Context;
-use heliomap::config::{DetectorArgs, JobArgs, Limits, MetricsArgs, StorageArgs, WebhookArgs};
+use heliomap::config::{DetectorArgs, JobArgs, Limits, MetricsArgs, RetentionArgs, StorageArgs, WebhookArgs};
 use heliomap::http;
 use heliomap::jobs::{PipelineMapper, Worker, WorkerSettings};
+use heliomap::store::freeing::free_unused;
 use heliomap::store::{Blobs, PostgresStore, SqliteStore, Store};
 use heliomap::telemetry::metrics::{self, Metrics, Scrape};
 use heliomap::webhooks::{Sender, SenderSettings};
@@ -35,6 +36,9 @@ const STALE_UPLOADS: Duration = Duration::from_secs(24 * 3600);
 
 /// Messages to webhooks are forgotten so long after they arrived or were given up.
 const OLD_DELIVERIES: Duration = Duration::from_secs(30 * 24 * 3600);
+
+/// How often, at the least, it is looked for bytes that nothing needs any more.
+const FREE_EVERY: Duration = Duration::from_secs(600);
 
 /// How long work in progress may take to end once the process was told to stop.
 const GRACE: Duration = Duration::from_secs(20);
@@ -121,6 +125,25 @@ fn send_messages(
             }
         }
     })
+}
+
+/// Deletes bytes that nothing needs any more beside what else the process does, until it stops.
+fn free_bytes(args: &RetentionArgs, store: &Arc<dyn Store>, blobs: &Blobs, stop: &CancellationToken) {
+    let (store, blobs, stop, kept) = (store.clone(), blobs.clone(), stop.clone(), args.keep_replaced);
+    tokio::spawn(async move {
+        loop {
+            let before = Timestamp::now().checked_sub(kept).unwrap_or(Timestamp::MIN);
+            match free_unused(&*store, &blobs, before).await {
+                Ok(0) => {}
+                Ok(freed) => tracing::info!(blobs = freed, "bytes that nothing needs any more are deleted"),
+                Err(error) => tracing::warn!(%error, "bytes that nothing needs any more cannot be deleted now"),
+            }
+            tokio::select! {
+                () = stop.cancelled() => return,
+                () = tokio::time::sleep(FREE_EVERY.min(kept)) => {}
+            }
+        }
+    });
 }
 
 /// Serves what the process counts, where that is asked for, until it stops.

@@ -157,6 +157,11 @@ impl From<StoreError> for ApiError {
         match &error {
             StoreError::Gone { what: "plant" } => Self::new(Code::PlantNotFound, "the plant was deleted meanwhile"),
             StoreError::OverQuota { what, used, quota } => super::usage::over_quota(what, *used, *quota),
+            StoreError::BeingFreed { .. } => Self::new(
+                Code::Unavailable,
+                "the same bytes were replaced before and are just being deleted; send the request again",
+            )
+            .retry_after(10),
             StoreError::Gone { .. } => Self::new(Code::SurveyNotFound, "the survey was deleted meanwhile"),
             error if error.is_full() => {
                 tracing::error!(%error, "storage is full");

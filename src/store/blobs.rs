@@ -287,6 +287,14 @@ impl Blobs {
         Ok(None)
     }
 
+    /// Deletes a blob; one that is not there is none of its worries.
+    pub async fn delete(&self, plant: PlantId, sha256: Digest) -> Result<(), StoreError> {
+        match self.store.delete(&key(plant, sha256)).await {
+            Ok(()) | Err(object_store::Error::NotFound { .. }) => Ok(()),
+            Err(error) => Err(error.into()),
+        }
+    }
+
     /// Deletes everything of a plant.
     pub async fn delete_plant(&self, plant: PlantId) -> Result<(), StoreError> {
         if let Some(root) = &self.local {

@@ -6,6 +6,7 @@
 pub mod access;
 pub mod blobs;
 pub mod bucket;
+pub mod freeing;
 pub mod postgres;
 pub mod records;
 pub mod requests;
@@ -36,7 +37,7 @@ pub use survey_path::{Content, FileKind, ImageName, InvalidPath, SurveyPath};
 pub use tasks::{GivenBack, ImageTask, OwnTask, TaskClaim, TaskStore};
 
 pub use uploads::{Upload, UploadId, UploadStore};
-pub use usage::{Quotas, Usage, UsageStore};
+pub use usage::{Quotas, UnusedBlob, Usage, UsageStore};
 pub use webhooks::{
     Delivery, DeliveryClaim, DeliveryId, DeliveryState, NewWebhook, Sent, SigningSecret, Webhook, WebhookId,
     WebhookStore,
@@ -52,6 +53,9 @@ pub enum StoreError {
     /// The row that a new row belongs to was deleted meanwhile.
     #[error("the {what} is gone")]
     Gone { what: &'static str },
+    /// The same bytes are just being deleted, because nothing named them any more: they may come again in a moment.
+    #[error("the blob {sha256} is being deleted")]
+    BeingFreed { sha256: Digest },
     /// The organisation may not keep so much.
     #[error("the organisation keeps {used} of the {quota} {what} that it may keep")]
     OverQuota { what: &'static str, used: u64, quota: u64 },
@@ -132,7 +136,8 @@ pub trait Store: AccessStore + UploadStore + RequestStore + TaskStore + WebhookS
     /// A plant's surveys whose names begin so, in the order of their creation.
     async fn surveys(&self, plant: PlantId, prefix: &str, page: Page) -> Result<Vec<Survey>, StoreError>;
 
-    /// Puts files into a survey, all or none; a file at the same path is replaced. One answer per file, in order.
+    /// Puts files into a survey, all or none; a file at the same path is replaced. One answer per file, in order. Their bytes
+    /// must be reserved, and stored: [`StoreError::BeingFreed`] where nothing named them for so long that they went.
     async fn put_files(&self, survey: SurveyId, files: &[FileRecord]) -> Result<Vec<FileWritten>, StoreError>;
     /// As [`Self::put_files`] of one file, where what is at its path is as wanted; `None` where it is not.
     async fn replace_file(

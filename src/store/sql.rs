@@ -73,8 +73,50 @@ pub const OWNER: &str = "SELECT organisation_id FROM plants WHERE id = $1";
 pub const BYTES_OF_ORGANISATION: &str =
     "SELECT CAST(COALESCE(SUM(bytes), 0) AS BIGINT) FROM plants WHERE organisation_id = $1";
 pub const PLANTS_OF_ORGANISATION: &str = "SELECT COUNT(*) FROM plants WHERE organisation_id = $1";
-pub const KEEP_BLOB: &str =
-    "INSERT INTO blobs (plant_id, sha256, size) VALUES ($1, $2, $3) ON CONFLICT (plant_id, sha256) DO NOTHING";
+/// Changes nothing. Whoever changes which blobs a plant has, or what names them, has the plant's row first: until its
+/// transaction ends, no other does, and two cannot wait for each other.
+pub const LOCK_PLANT: &str = "UPDATE plants SET bytes = bytes WHERE id = $1 RETURNING id";
+pub const LOCK_PLANT_OF_SURVEY: &str =
+    "UPDATE plants SET bytes = bytes WHERE id = (SELECT plant_id FROM surveys WHERE id = $1) RETURNING id";
+/// One that rows name stays named.
+pub const RESERVE_BLOB: &str = "\
+    UPDATE blobs SET unused_ms = CASE WHEN unused_ms IS NULL THEN NULL ELSE $3 END \
+    WHERE plant_id = $1 AND sha256 = $2 AND freeing_ms IS NULL";
+pub const KEEP_BLOB: &str = "\
+    INSERT INTO blobs (plant_id, sha256, size, unused_ms) VALUES ($1, $2, $3, $4) \
+    ON CONFLICT (plant_id, sha256) DO NOTHING";
+pub const NAME_BLOB: &str =
+    "UPDATE blobs SET unused_ms = NULL WHERE plant_id = $1 AND sha256 = $2 AND freeing_ms IS NULL";
+
+macro_rules! unnamed {
+    () => {
+        "NOT EXISTS (SELECT 1 FROM files JOIN surveys ON surveys.id = files.survey_id \
+         WHERE surveys.plant_id = blobs.plant_id AND files.sha256 = blobs.sha256) \
+         AND NOT EXISTS (SELECT 1 FROM models WHERE models.plant_id = blobs.plant_id AND models.sha256 = blobs.sha256)"
+    };
+}
+macro_rules! without_job {
+    () => {
+        "NOT EXISTS (SELECT 1 FROM jobs WHERE jobs.plant_id = blobs.plant_id AND jobs.state = 'running')"
+    };
+}
+pub const UNNAME_BLOB: &str =
+    concat!("UPDATE blobs SET unused_ms = $3 WHERE plant_id = $1 AND sha256 = $2 AND ", unnamed!());
+pub const PLANTS_WITH_UNUSED_BLOBS: &str = concat!(
+    "SELECT DISTINCT plant_id AS id FROM blobs WHERE unused_ms < $1 AND (freeing_ms IS NULL OR freeing_ms < $2) AND ",
+    without_job!(),
+    " ORDER BY plant_id LIMIT $3"
+);
+pub const TAKE_UNUSED_BLOBS: &str = concat!(
+    "UPDATE blobs SET freeing_ms = $5 WHERE plant_id = $1 AND sha256 IN (SELECT blobs.sha256 FROM blobs \
+     WHERE plant_id = $1 AND unused_ms < $2 AND (freeing_ms IS NULL OR freeing_ms < $3) AND ",
+    unnamed!(),
+    " AND ",
+    without_job!(),
+    " ORDER BY sha256 LIMIT $4) RETURNING plant_id, sha256, size"
+);
+pub const FORGET_BLOB: &str =
+    "DELETE FROM blobs WHERE plant_id = $1 AND sha256 = $2 AND freeing_ms = $3 RETURNING size";
 pub const COUNT_BYTES: &str = "UPDATE plants SET bytes = bytes + $2 WHERE id = $1";
 
 pub const CREATE_KEY: &str = concat!(
@@ -148,13 +190,12 @@ pub const SURVEYS: &str = concat!(
 );
 
 pub const FILE_DIGEST: &str = "SELECT sha256 FROM files WHERE survey_id = $1 AND path = $2";
-/// Over what is there only where that has the digest `$11`, or where none is given.
 pub const PUT_FILE: &str = "\
     INSERT INTO files (survey_id, path, kind, size, sha256, width_px, height_px, photo, shots, stored_ms) \
     VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10) \
     ON CONFLICT (survey_id, path) DO UPDATE SET kind = excluded.kind, size = excluded.size, sha256 = excluded.sha256, \
     width_px = excluded.width_px, height_px = excluded.height_px, photo = excluded.photo, shots = excluded.shots, \
-    stored_ms = excluded.stored_ms WHERE files.sha256 = COALESCE($11, files.sha256)";
+    stored_ms = excluded.stored_ms";
 /// What older versions did not look for.
 pub const COMPLETE_FILE: &str = "\
     UPDATE files SET photo = $3, shots = $4 WHERE survey_id = $1 AND path = $2 AND photo IS NULL AND shots IS NULL";

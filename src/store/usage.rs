@@ -1,8 +1,9 @@
 //! What an organisation keeps, and what it may keep.
 
-use super::{Digest, Organisation, OrganisationId, StoreError};
+use super::{BlobRecord, Digest, Organisation, OrganisationId, StoreError};
 use crate::plant::PlantId;
 use jiff::Timestamp;
+use std::time::Duration;
 
 /// As much as there is room for.
 pub const UNLIMITED: u64 = i64::MAX as u64;
@@ -35,6 +36,14 @@ pub struct Usage {
     pub own: Quotas,
 }
 
+/// A blob that no row names, in the hands of whoever deletes its bytes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct UnusedBlob {
+    pub blob: BlobRecord,
+    /// When it was taken to be deleted.
+    pub taken: Timestamp,
+}
+
 /// What organisations keep, and may keep.
 #[async_trait::async_trait]
 pub trait UsageStore: Send + Sync + 'static {
@@ -45,7 +54,27 @@ pub trait UsageStore: Send + Sync + 'static {
     /// Says what an organisation may keep.
     async fn set_quotas(&self, organisation: OrganisationId, own: Quotas) -> Result<(), StoreError>;
     /// Counts bytes that are about to be stored in a plant, each by digest and size; those that it keeps already count for
-    /// nothing more. [`StoreError::OverQuota`] where they do not fit: none is counted then. `defaults` holds for what was not
-    /// said of the organisation alone.
-    async fn reserve_bytes(&self, plant: PlantId, blobs: &[(Digest, u64)], defaults: Quotas) -> Result<(), StoreError>;
+    /// nothing more. [`StoreError::OverQuota`] where they do not fit, [`StoreError::BeingFreed`] where some are just being
+    /// deleted: none is counted then. `defaults` holds for what was not said of the organisation alone. What no row comes to
+    /// name is unused from `now` on.
+    async fn reserve_bytes(
+        &self,
+        plant: PlantId,
+        blobs: &[(Digest, u64)],
+        defaults: Quotas,
+        now: Timestamp,
+    ) -> Result<(), StoreError>;
+
+    /// Takes blobs that have been unused since before a time, so that their bytes can be deleted: of each of at most `limit`
+    /// plants at most as many, and none of a plant of which a job runs, for that may still read them. Until it is told that
+    /// one is gone nobody may reserve or name it; where that is not told within `lease`, it is taken again.
+    async fn take_unused_blobs(
+        &self,
+        before: Timestamp,
+        lease: Duration,
+        limit: u32,
+        now: Timestamp,
+    ) -> Result<Vec<UnusedBlob>, StoreError>;
+    /// Notes that the bytes of a blob are gone, which counts no more; `false` where it was taken again, or is forgotten.
+    async fn blob_is_gone(&self, unused: &UnusedBlob) -> Result<bool, StoreError>;
 }

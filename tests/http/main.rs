@@ -16,6 +16,7 @@ mod oidc;
 mod plants;
 mod quotas;
 mod reconstruction;
+mod replaced;
 mod sharing;
 mod tenants;
 mod tus;

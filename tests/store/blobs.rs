@@ -40,6 +40,7 @@ on_both!(
     stored_bytes_come_back,
     large_files_come_back,
     the_same_bytes_are_stored_once,
+    a_deleted_blob_leaves_the_others,
     a_deleted_plant_leaves_nothing,
     what_is_missing_is_told,
     uploads_on_their_way_stay_on_this_machine,
@@ -112,6 +113,19 @@ async fn the_same_bytes_are_stored_once(blobs: &Blobs, _data: &Path) {
 }
 
 /// More blobs than a page of a bucket's list holds.
+async fn a_deleted_blob_leaves_the_others(blobs: &Blobs, _data: &Path) {
+    let [gone, kept] = ["gone", "kept"].map(|text| blobs.put_bytes(plant(1), text.into()));
+    let (gone, kept) = (gone.await.unwrap(), kept.await.unwrap());
+    blobs.put_bytes(plant(2), b"gone".to_vec()).await.unwrap();
+    blobs.delete(plant(1), gone).await.unwrap();
+    assert!(blobs.get(plant(1), gone).await.is_err());
+    assert_eq!(blobs.get(plant(1), kept).await.unwrap(), "kept");
+    assert_eq!(blobs.get(plant(2), gone).await.unwrap(), "gone");
+    blobs.delete(plant(1), gone).await.unwrap();
+    assert_eq!(blobs.put_bytes(plant(1), b"gone".to_vec()).await.unwrap(), gone);
+    assert_eq!(blobs.get(plant(1), gone).await.unwrap(), "gone");
+}
+
 async fn a_deleted_plant_leaves_nothing(blobs: &Blobs, _data: &Path) {
     let puts = (0..1100_u32).map(|k| blobs.put_file(plant(1), staged(blobs, &k.to_le_bytes())));
     let mut puts = futures::stream::StreamExt::buffer_unordered(futures::stream::iter(puts), 16);

@@ -2,6 +2,7 @@
 
 mod access;
 mod files;
+mod freeing;
 mod jobs;
 mod models;
 mod plants;
@@ -11,6 +12,7 @@ mod webhooks;
 
 pub use access::*;
 pub use files::*;
+pub use freeing::*;
 pub use jobs::*;
 pub use models::*;
 pub use plants::*;
@@ -20,8 +22,8 @@ pub use webhooks::*;
 
 use heliomap::plant::{Layer, ModuleId, PlantId, Warning};
 use heliomap::store::{
-    Claim, Created, Digest, Enqueued, FileRecord, GeoBox, Job, JobRequest, JobState, NewFeature, NewLayer, NewModel,
-    OrganisationId, Page, Plant, Quotas, Store, Survey, SurveyPath,
+    Claim, Created, Digest, Enqueued, FileRecord, FileWritten, GeoBox, Job, JobRequest, JobState, NewFeature, NewLayer,
+    NewModel, OrganisationId, Page, Plant, Quotas, Store, StoreError, Survey, SurveyPath,
 };
 use jiff::Timestamp;
 use std::time::Duration;
@@ -73,6 +75,17 @@ fn file(path: &str, content: &str) -> FileRecord {
         shots: None,
         stored: at(0),
     }
+}
+
+/// Puts files whose bytes are reserved, as an upload does.
+async fn put(store: &dyn Store, survey: &Survey, files: &[FileRecord]) -> Vec<FileWritten> {
+    reserve(store, survey.plant, files).await.unwrap();
+    store.put_files(survey.id, files).await.unwrap()
+}
+
+async fn reserve(store: &dyn Store, plant: PlantId, files: &[FileRecord]) -> Result<(), StoreError> {
+    let blobs: Vec<_> = files.iter().map(|file| (file.sha256, file.size)).collect();
+    store.reserve_bytes(plant, &blobs, Quotas::default(), files[0].stored).await
 }
 
 /// A model of `columns` modules in a row along a parallel, a thousandth of a degree apart.

@@ -10,10 +10,11 @@ use super::conditional;
 use super::error::{ApiError, Code};
 use super::state::AppState;
 use crate::plant::PlantId;
-use crate::store::{FileKind, FileRecord, FileWritten, StagedFile, SurveyId, SurveyPath, Wanted};
+use crate::store::{Digest, FileKind, FileRecord, FileWritten, StagedFile, StoreError, SurveyId, SurveyPath, Wanted};
 use content::Found;
 use jiff::Timestamp;
 use std::path::Path;
+use std::time::{Duration, Instant};
 
 /// A file that came in, was checked, and is not stored yet.
 pub struct Checked {
@@ -32,6 +33,11 @@ pub struct Stored {
 
 /// How many photos with the same bytes are named.
 pub const MAX_TWINS: u32 = 5;
+
+/// How long an upload waits while the bytes that it brings again are being deleted, which takes a moment, and how often it
+/// looks.
+const WAIT_FOR_FREEING: Duration = Duration::from_secs(5);
+const LOOK_EVERY: Duration = Duration::from_millis(50);
 
 /// Checks that a staged file holds what its place in the survey says.
 pub async fn check(state: &AppState, path: SurveyPath, staged: StagedFile) -> Result<Checked, ApiError> {
@@ -64,7 +70,7 @@ pub async fn store(
     let now = Timestamp::now();
     let stored = Timestamp::from_millisecond(now.as_millisecond()).unwrap_or(now);
     let blobs: Vec<_> = files.iter().map(|file| (file.staged.sha256, file.staged.size)).collect();
-    state.store.reserve_bytes(plant, &blobs, state.limits.quotas()).await?;
+    reserve(state, plant, &blobs).await?;
     let mut records = Vec::with_capacity(files.len());
     for Checked { path, staged, found } in files {
         let Found { size_px, photo, shots } = found;
@@ -97,6 +103,19 @@ pub async fn store(
     Ok(stored)
 }
 
+/// Counts bytes that are about to be stored.
+async fn reserve(state: &AppState, plant: PlantId, blobs: &[(Digest, u64)]) -> Result<(), StoreError> {
+    let begun = Instant::now();
+    loop {
+        match state.store.reserve_bytes(plant, blobs, state.limits.quotas(), Timestamp::now()).await {
+            Err(StoreError::BeingFreed { .. }) if begun.elapsed() < WAIT_FOR_FREEING => {
+                tokio::time::sleep(LOOK_EVERY).await;
+            }
+            other => return other,
+        }
+    }
+}
+
 /// Other photos of the survey with the bytes of a photo, the first few.
 async fn twins(state: &AppState, survey: SurveyId, file: &FileRecord) -> Result<Vec<SurveyPath>, ApiError> {
     if file.path.kind() != FileKind::Image {
@@ -110,7 +129,7 @@ async fn twins(state: &AppState, survey: SurveyId, file: &FileRecord) -> Result<
 
 /// A failure of the service's own disk.
 pub fn disk(path: &Path, source: std::io::Error) -> ApiError {
-    crate::store::StoreError::Io { action: "use the file", path: path.to_owned(), source }.into()
+    StoreError::Io { action: "use the file", path: path.to_owned(), source }.into()
 }
 
 /// A file too large, by its name.

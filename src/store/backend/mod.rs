@@ -155,10 +155,11 @@ impl Store for Rows {
 
     async fn put_files(&self, survey: SurveyId, files: &[FileRecord]) -> Result<Vec<FileWritten>, StoreError> {
         let mut tx = self.begin().await?;
+        let plant = usage::lock_plant_of(&mut tx, survey).await?;
         let mut written = Vec::with_capacity(files.len());
         for file in files {
             // Without a condition a file is always put.
-            written.extend(put_file(&mut tx, survey, file, None).await?);
+            written.extend(put_file(&mut tx, plant, survey, file, None).await?);
         }
         tx.commit().await?;
         Ok(written)
@@ -171,7 +172,8 @@ impl Store for Rows {
         wanted: &Wanted,
     ) -> Result<Option<FileWritten>, StoreError> {
         let mut tx = self.begin().await?;
-        let written = put_file(&mut tx, survey, file, Some(wanted)).await?;
+        let plant = usage::lock_plant_of(&mut tx, survey).await?;
+        let written = put_file(&mut tx, plant, survey, file, Some(wanted)).await?;
         tx.commit().await?;
         Ok(written)
     }
@@ -421,7 +423,7 @@ impl Store for Rows {
         };
         let stored = model(&row)?;
         // A model counts, and no quota keeps a job from its end.
-        usage::count_bytes(&mut tx, claim.job.plant, &[(new.sha256, new.size)]).await?;
+        usage::count_bytes(&mut tx, claim.job.plant, &[(new.sha256, new.size)], None).await?;
         for layer in &new.layers {
             let extents = || layer.features.iter().filter_map(|feature| feature.extent);
             let extent = extents().reduce(GeoBox::union);
@@ -577,9 +579,10 @@ async fn sweep(tx: &mut Tx) -> Result<(), StoreError> {
     Ok(())
 }
 
-/// Puts a file where what is at its path is as wanted.
+/// Puts a file where what is at its path is as wanted. Whoever calls has the plant's row: what is looked at stays so.
 async fn put_file(
     tx: &mut Tx,
+    plant: PlantId,
     survey: SurveyId,
     file: &FileRecord,
     wanted: Option<&Wanted>,
@@ -610,9 +613,8 @@ async fn put_file(
             .await?;
         return Ok(Some(verdict));
     }
-    // What was looked at is what is replaced, whoever puts a file there meanwhile; no digest is empty.
-    let still = wanted.map(|_| before.unwrap_or_default());
-    let done = sqlx::query(sql::PUT_FILE)
+    usage::name_blob(tx, plant, file.sha256).await?;
+    sqlx::query(sql::PUT_FILE)
         .bind(survey.to_string())
         .bind(file.path.as_str())
         .bind(file.path.kind().as_str())
@@ -623,11 +625,12 @@ async fn put_file(
         .bind(photo)
         .bind(shots)
         .bind(file.stored.as_millisecond())
-        .bind(still)
         .execute(&mut **tx)
-        .await
-        .map_err(gone("survey"))?;
-    Ok((done.rows_affected() > 0).then_some(verdict))
+        .await?;
+    if let Some(before) = before {
+        usage::unname_blob(tx, plant, &before, file.stored).await?;
+    }
+    Ok(Some(verdict))
 }
 
 /// Inserts features that follow each other in a layer, the first with the sequence number `first`, by one statement.

@@ -1,6 +1,6 @@
 //! Files of surveys, and how they come.
 
-use super::{at, claim, enqueue, file, model, plant, survey};
+use super::{at, claim, enqueue, file, model, plant, put, reserve, survey};
 use heliomap::reconstruction::PhotoFacts;
 use heliomap::store::{
     Digest, FileRecord, FileWritten, Store, StoreError, SurveyId, SurveyPath, Upload, UploadId, Wanted,
@@ -10,11 +10,11 @@ use uuid::Uuid;
 pub async fn files_all_or_none(store: &dyn Store) {
     let survey = survey(store, plant(store, "A").await.id, "June").await;
     let (a, b) = (file("images/a.jpg", "a"), file("reconstruction.json", "b"));
-    let written = store.put_files(survey.id, &[a.clone(), b.clone()]).await.unwrap();
+    let written = put(store, &survey, &[a.clone(), b.clone()]).await;
     assert_eq!(written, [FileWritten::Created, FileWritten::Created]);
     let mut changed = file("images/a.jpg", "other");
     changed.size_px = Some([4, 3]);
-    let written = store.put_files(survey.id, &[changed, b]).await.unwrap();
+    let written = put(store, &survey, &[changed, b]).await;
     assert_eq!(written, [FileWritten::Replaced, FileWritten::Unchanged]);
     let files = store.files(survey.id).await.unwrap();
     assert_eq!((files.len(), files[0].size, files[0].size_px), (2, 5, Some([4, 3])));
@@ -34,15 +34,15 @@ pub async fn photos_and_what_was_found_in_them(store: &dyn Store) {
     }))
     .unwrap();
     let plain = [file("images/b.jpg", "1"), file("images/a.jpg", "1"), file("images/c.jpg", "2")];
-    store.put_files(survey.id, &plain).await.unwrap();
+    put(store, &survey, &plain).await;
     let told = FileRecord { photo: Some(facts.clone()), ..file("images/b.jpg", "1") };
-    assert_eq!(store.put_files(survey.id, &[told]).await.unwrap(), [FileWritten::Unchanged]);
+    assert_eq!(put(store, &survey, &[told]).await, [FileWritten::Unchanged]);
     let shots = Some(vec!["a.jpg".to_owned(), "d.jpg".to_owned()]);
     let others = [
         FileRecord { shots: shots.clone(), ..file("reconstruction.json", "1") },
         file("undistorted/images/a.jpg", "1"),
     ];
-    store.put_files(survey.id, &others).await.unwrap();
+    put(store, &survey, &others).await;
 
     let first = store.photos(survey.id, "", 2).await.unwrap();
     let names = |photos: &[FileRecord]| photos.iter().map(|p| p.path.file_name().to_owned()).collect::<Vec<_>>();
@@ -93,7 +93,9 @@ pub async fn uploads(store: &dyn Store) {
 pub async fn a_file_is_replaced_only_where_it_is_as_wanted(store: &dyn Store) {
     let survey = survey(store, plant(store, "A").await.id, "June").await;
     let put = async |content: &str, wanted: Wanted| {
-        store.replace_file(survey.id, &file("images/a.jpg", content), &wanted).await.unwrap()
+        let file = file("images/a.jpg", content);
+        reserve(store, survey.plant, std::slice::from_ref(&file)).await.unwrap();
+        store.replace_file(survey.id, &file, &wanted).await.unwrap()
     };
     let of = |content: &str| Wanted::OneOf(vec![Digest::of(b"other"), Digest::of(content.as_bytes())]);
     assert_eq!(put("1", Wanted::Anything).await, None);
@@ -112,7 +114,11 @@ pub async fn a_file_is_replaced_only_where_it_is_as_wanted(store: &dyn Store) {
     // Of many who saw the same and replace it at once, one does.
     let many = (0..8).map(|number| {
         let replaced = file("images/a.jpg", &format!("by {number}"));
-        async move { store.replace_file(survey.id, &replaced, &of("3")).await.unwrap() }
+        let survey = &survey;
+        async move {
+            reserve(store, survey.plant, std::slice::from_ref(&replaced)).await.unwrap();
+            store.replace_file(survey.id, &replaced, &of("3")).await.unwrap()
+        }
     });
     let outcomes = futures::future::join_all(many).await;
     assert_eq!(outcomes.iter().filter(|outcome| outcome.is_some()).count(), 1, "{outcomes:?}");
@@ -122,9 +128,9 @@ pub async fn blobs_that_rows_name(store: &dyn Store) {
     let (a, b) = (plant(store, "A").await.id, plant(store, "B").await.id);
     let (june, july) = (survey(store, a, "June").await, survey(store, a, "July").await);
     let other = survey(store, b, "June").await;
-    store.put_files(june.id, &[file("images/a.jpg", "1"), file("images/b.jpg", "22")]).await.unwrap();
-    store.put_files(july.id, &[file("images/c.jpg", "1")]).await.unwrap();
-    store.put_files(other.id, &[file("images/a.jpg", "1")]).await.unwrap();
+    put(store, &june, &[file("images/a.jpg", "1"), file("images/b.jpg", "22")]).await;
+    put(store, &july, &[file("images/c.jpg", "1")]).await;
+    put(store, &other, &[file("images/a.jpg", "1")]).await;
     enqueue(store, &june).await;
     let running = claim(store, 0).await.unwrap();
     store.complete_job(&running, &model(a, 1, 1), at(1)).await.unwrap();
@@ -145,6 +151,6 @@ pub async fn blobs_that_rows_name(store: &dyn Store) {
     expected.sort();
     assert_eq!(found, expected);
     // What is replaced is named no more.
-    store.put_files(june.id, &[file("images/b.jpg", "1")]).await.unwrap();
+    put(store, &june, &[file("images/b.jpg", "1")]).await;
     assert_eq!(store.blobs(None, 9).await.unwrap().len(), 3);
 }

@@ -1,6 +1,6 @@
 //! Plants, surveys, and lists of them.
 
-use super::{ALL, LEASE, ORGANISATION, at, claim, enqueue, file, model, plant, survey};
+use super::{ALL, LEASE, ORGANISATION, at, claim, enqueue, file, model, plant, put, survey};
 use heliomap::plant::{Layer, ModuleId, PlantId};
 use heliomap::store::{
     AuditEntry, Created, Digest, Heartbeat, JobState, NewKey, Page, Quotas, Scope, SecretRecord, Store, StoreError,
@@ -35,7 +35,7 @@ pub async fn plants_and_surveys(store: &dyn Store) {
 
 pub async fn a_deleted_plant_takes_everything_with_it(store: &dyn Store) {
     let survey = survey(store, plant(store, "A").await.id, "June").await;
-    store.put_files(survey.id, &[file("images/a.jpg", "a")]).await.unwrap();
+    put(store, &survey, &[file("images/a.jpg", "a")]).await;
     enqueue(store, &survey).await;
     let first = claim(store, 0).await.unwrap();
     store.complete_job(&first, &model(survey.plant, 1, 3), at(1)).await.unwrap();

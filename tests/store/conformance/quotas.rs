@@ -16,15 +16,15 @@ pub async fn quotas(store: &dyn Store) {
     // The same bytes count once in a plant, whoever says so again.
     let (one, two) = ((Digest::of(b"1"), 60), (Digest::of(b"2"), 50));
     let none = Quotas::default();
-    store.reserve_bytes(a.id, &[one, one], none).await.unwrap();
-    store.reserve_bytes(a.id, &[one], none).await.unwrap();
+    store.reserve_bytes(a.id, &[one, one], none, at(1)).await.unwrap();
+    store.reserve_bytes(a.id, &[one], none, at(1)).await.unwrap();
     assert_eq!(usage().await.bytes, 60);
     let tight = Quotas { bytes: Some(100), plants: Some(1) };
-    let refused = store.reserve_bytes(a.id, &[two], tight).await;
+    let refused = store.reserve_bytes(a.id, &[two], tight, at(1)).await;
     assert!(matches!(refused, Err(StoreError::OverQuota { what: "bytes", used: 60, quota: 100 })), "{refused:?}");
     assert_eq!(usage().await.bytes, 60);
-    store.reserve_bytes(a.id, &[one], Quotas { bytes: Some(10), plants: None }).await.unwrap();
-    let nowhere = store.reserve_bytes(PlantId(Uuid::nil()), &[one], none).await;
+    store.reserve_bytes(a.id, &[one], Quotas { bytes: Some(10), plants: None }, at(1)).await.unwrap();
+    let nowhere = store.reserve_bytes(PlantId(Uuid::nil()), &[one], none, at(1)).await;
     assert!(matches!(nowhere, Err(StoreError::Gone { what: "plant" })));
 
     // What is said of one organisation goes before what holds for all.
@@ -36,7 +36,7 @@ pub async fn quotas(store: &dyn Store) {
     let Created::New(b) = store.create_plant(ORGANISATION, "B", tight, at(1)).await.unwrap() else {
         panic!("there is room for two")
     };
-    store.reserve_bytes(b.id, &[two], tight).await.unwrap();
+    store.reserve_bytes(b.id, &[two], tight, at(1)).await.unwrap();
     let june = survey(store, a.id, "June").await;
     let upload = |id: u128, length, outcome: bool, expires| Upload {
         id: UploadId(Uuid::from_u128(id)),
