@@ -1,10 +1,11 @@
 //! The photos of a survey, each with a verdict: what the pilot should know before leaving the field.
 
 use super::AppState;
-use super::error::{ApiError, Code, Problem};
+use super::error::{ApiError, Problem};
 use super::extract::{ApiPath, ApiQuery};
+use super::file_lists::{check_warning, cursor_after, has_warning, path_of};
 use super::intake;
-use super::paging::{List, list_limit};
+use super::paging::{List, list_limit, next_part, prefix_filter, with_filters};
 use crate::jobs;
 use crate::plant::PlantId;
 use crate::reconstruction::PhotoFacts;
@@ -20,8 +21,6 @@ use std::collections::{BTreeSet, HashMap};
 
 /// Photos per look into the store.
 const CHUNK: u32 = 1000;
-/// Longest cursor: two digits for each byte of a path.
-const MAX_CURSOR: usize = 800;
 
 /// A file of a survey.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
@@ -125,9 +124,6 @@ pub struct PhotoWarning {
     pub message: String,
 }
 
-/// Words of all warnings of photos.
-const WARNINGS: [&str; 6] = ["blurred", "underexposed", "overexposed", "no_position", "no_time", "duplicate"];
-
 fn warnings(file: &FileRecord, twins: &[SurveyPath]) -> Vec<PhotoWarning> {
     let Some(photo) = &file.photo else { return Vec::new() };
     let mut warnings = Vec::new();
@@ -187,8 +183,11 @@ pub struct ImagesQuery {
     /// Where to go on: taken from the link to the next part.
     #[param(pattern = "^([0-9a-f]{2})+$", max_length = 800)]
     pub cursor: Option<String>,
+    /// Only photos whose names begin so.
+    #[param(max_length = 200, example = "DJI_00")]
+    pub name: Option<String>,
     /// Only photos with this warning: `blurred`, `underexposed`, `overexposed`, `no_position`, `no_time`, `duplicate`, or
-    /// `any`.
+    /// `any`; or with `none`.
     #[param(example = "blurred")]
     pub warning: Option<String>,
     /// Only photos from which the reconstruction was made (`true`) or was not (`false`).
@@ -196,38 +195,19 @@ pub struct ImagesQuery {
 }
 
 impl ImagesQuery {
-    /// The path after which to go on: whatever its bytes are, only its place in the order counts.
-    fn after(&self) -> Result<String, ApiError> {
-        let Some(cursor) = &self.cursor else { return Ok(String::new()) };
-        let byte = |pair: &[u8]| u8::from_str_radix(std::str::from_utf8(pair).ok()?, 16).ok();
-        let bytes: Option<Vec<u8>> = cursor.as_bytes().chunks(2).map(byte).collect();
-        let well_formed = (2..=MAX_CURSOR).contains(&cursor.len()) && cursor.len() % 2 == 0;
-        let text = bytes.filter(|_| well_formed).map(|bytes| String::from_utf8_lossy(&bytes).replace('\0', ""));
-        let wrong = "the cursor is none of this service's: take it from the link to the next part";
-        text.ok_or(ApiError::new(Code::InvalidQuery, wrong))
-    }
-
-    fn check_warning(&self) -> Result<(), ApiError> {
-        match self.warning.as_deref() {
-            Some(warning) if warning != "any" && !WARNINGS.contains(&warning) => {
-                Err(ApiError::new(Code::InvalidQuery, format!("warning must be any or one of {}", WARNINGS.join(", "))))
-            }
-            _ => Ok(()),
-        }
-    }
-
     fn wants(&self, image: &ImageView) -> bool {
-        let warned = |wanted: &str| image.file.warnings.iter().any(|warning| wanted == "any" || warning.code == wanted);
-        self.warning.as_deref().is_none_or(warned)
+        has_warning(&image.file, self.warning.as_deref())
             && self.reconstructed.is_none_or(|wanted| image.reconstructed == Some(wanted))
     }
 
     /// The link to the part after a photo.
     fn next(&self, survey: &str, limit: u32, last: &str) -> String {
-        let cursor: String = last.bytes().map(|byte| format!("{byte:02x}")).collect();
-        let warning = self.warning.as_ref().map(|warning| format!("&warning={warning}")).unwrap_or_default();
-        let reconstructed = self.reconstructed.map(|only| format!("&reconstructed={only}")).unwrap_or_default();
-        format!("{survey}/images?limit={limit}&cursor={cursor}{warning}{reconstructed}")
+        let filters = [
+            ("name", self.name.clone()),
+            ("warning", self.warning.clone()),
+            ("reconstructed", self.reconstructed.map(|only| only.to_string())),
+        ];
+        next_part(&with_filters(&format!("{survey}/images"), &filters), limit, cursor_after(last))
     }
 }
 
@@ -279,9 +259,10 @@ impl<'a> Photos<'a> {
         Ok(Self { state, survey, alike, shots })
     }
 
-    async fn part(&self, after: &str, limit: u32) -> Result<Vec<ImageView>, ApiError> {
+    /// At most `limit` photos after a path, of those whose names begin so.
+    async fn part(&self, name: &str, after: &str, limit: u32) -> Result<Vec<ImageView>, ApiError> {
         let mut images = Vec::new();
-        for file in self.state.store.photos(self.survey, after, limit).await? {
+        for file in self.state.store.photos(self.survey, name, after, limit).await? {
             let twins = self.alike.twins(&file);
             let name = file.path.file_name().to_owned();
             let reconstructed = self.shots.as_ref().map(|shots| jobs::is_shot(shots, &name));
@@ -319,14 +300,15 @@ pub async fn list(
     ApiPath((plant, survey)): ApiPath<(PlantId, SurveyId)>,
     ApiQuery(query): ApiQuery<ImagesQuery>,
 ) -> Result<List<ImageView>, ApiError> {
-    let (limit, mut after) = (list_limit(query.limit)?, query.after()?);
-    query.check_warning()?;
+    let (limit, mut after) = (list_limit(query.limit)?, path_of(query.cursor.as_deref())?);
+    let name = prefix_filter(query.name.as_deref())?;
+    check_warning(query.warning.as_deref())?;
     state.require_survey(plant, survey).await?;
     let photos = Photos::of(&state, survey).await?;
     let mut items: Vec<ImageView> = Vec::new();
     // One more than is shown tells whether there is a next part.
     while items.len() <= limit as usize {
-        let part = photos.part(&after, CHUNK.min(limit + 1)).await?;
+        let part = photos.part(&name, &after, CHUNK.min(limit + 1)).await?;
         let Some(last) = part.last() else { break };
         after.clone_from(&last.file.path);
         items.extend(part.into_iter().filter(|image| query.wants(image)));
@@ -366,7 +348,7 @@ pub async fn positions(
     let mut features = Vec::new();
     let mut after = String::new();
     loop {
-        let part = photos.part(&after, CHUNK).await?;
+        let part = photos.part("", &after, CHUNK).await?;
         let Some(last) = part.last() else { break };
         after.clone_from(&last.file.path);
         features.extend(part.iter().filter_map(feature));

@@ -10,6 +10,7 @@ mod docs;
 mod events;
 mod extract;
 mod features;
+mod file_lists;
 mod guard;
 mod health;
 mod idempotency;

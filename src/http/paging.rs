@@ -52,6 +52,12 @@ pub fn with_filters(list: &str, filters: &[(&str, Option<String>)]) -> String {
     if told.is_empty() { list.to_owned() } else { format!("{list}?{}", told.join("&")) }
 }
 
+/// The next part of a list at a path with its filters.
+pub fn next_part(path: &str, limit: u32, cursor: impl std::fmt::Display) -> String {
+    let mark = if path.contains('?') { '&' } else { '?' };
+    format!("{path}{mark}limit={limit}&cursor={cursor}")
+}
+
 /// A value as a URL's query may hold it (RFC 3986).
 fn encoded(value: &str) -> String {
     let byte = |byte: u8| match byte {
@@ -112,10 +118,7 @@ impl PageQuery {
         let more = rows.len() > limit as usize;
         let mut last = None;
         let items = rows.into_iter().take(limit as usize).inspect(|row| last = Some(seq(row))).map(view).collect();
-        let next = last.filter(|_| more).map(|last| {
-            let mark = if path.contains('?') { '&' } else { '?' };
-            format!("{path}{mark}limit={limit}&cursor={last}")
-        });
+        let next = last.filter(|_| more).map(|last| next_part(path, limit, last));
         Ok(List { items, next })
     }
 }

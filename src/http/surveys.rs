@@ -3,15 +3,16 @@
 use super::AppState;
 use super::error::{ApiError, Code, Problem};
 use super::extract::{ApiJson, ApiPath, ApiQuery};
+use super::file_lists::{check_warning, cursor_after, has_warning, path_of};
 use super::images::{self, FileView, ImagesSummary};
-use super::paging::{List, filtered_list, prefix_filter};
+use super::paging::{List, filtered_list, list_limit, next_link, next_part, prefix_filter, with_filters};
 use super::plants::{checked_name, created_answer};
 use crate::jobs;
 use crate::plant::PlantId;
 use crate::store::{Created, FileKind, FileRecord, Survey, SurveyId};
 use axum::Json;
 use axum::extract::State;
-use axum::response::Response;
+use axum::response::{IntoResponse, Response};
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
@@ -53,8 +54,11 @@ pub struct SurveyDetail {
     pub missing: Vec<MissingView>,
     /// How photos and reconstruction go together.
     pub images: ImagesSummary,
-    /// Sorted by path.
+    /// Sorted by path; all, or the part that was asked for.
     pub files: Vec<FileView>,
+    /// The next part of the files, where there is one; also in the header `link`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub next: Option<String>,
 }
 
 /// Something that a survey lacks.
@@ -81,9 +85,54 @@ filtered_list!(
 #[serde(deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub struct FilesQuery {
+    /// Most files in the answer; all where it is left out.
+    #[param(minimum = 1, maximum = 1000)]
+    pub limit: Option<u32>,
+    /// Where to go on: taken from the link to the next part.
+    #[param(pattern = "^([0-9a-f]{2})+$", max_length = 800)]
+    pub cursor: Option<String>,
     /// Only files of this kind: `image` or `reconstruction`.
     #[param(pattern = "^(image|reconstruction)$")]
     pub kind: Option<String>,
+    /// Only files whose places in the survey's folder begin so.
+    #[param(max_length = 400, example = "undistorted/")]
+    pub path: Option<String>,
+    /// Only files with this warning: `blurred`, `underexposed`, `overexposed`, `no_position`, `no_time`, `duplicate`, or
+    /// `any`; or with `none`, as all have that are no photos.
+    #[param(example = "any")]
+    pub warning: Option<String>,
+}
+
+impl FilesQuery {
+    fn check(&self) -> Result<(), ApiError> {
+        let kinds = [FileKind::Image, FileKind::Reconstruction].map(FileKind::as_str);
+        if self.kind.as_deref().is_some_and(|kind| !kinds.contains(&kind)) {
+            return Err(ApiError::new(Code::InvalidQuery, format!("kind must be {}", kinds.join(" or "))));
+        }
+        if self.path.as_ref().is_some_and(|path| path.chars().count() > 400) {
+            return Err(ApiError::new(Code::InvalidQuery, "path is longer than 400 characters, as no place is"));
+        }
+        check_warning(self.warning.as_deref())
+    }
+
+    fn wants(&self, file: &FileView) -> bool {
+        self.kind.as_deref().is_none_or(|kind| file.kind == kind)
+            && self.path.as_deref().is_none_or(|prefix| file.path.starts_with(prefix))
+            && has_warning(file, self.warning.as_deref())
+    }
+
+    /// The part that is asked for of files sorted by path, and the link to the next one.
+    fn part(&self, survey: &str, mut files: Vec<FileView>) -> Result<(Vec<FileView>, Option<String>), ApiError> {
+        let (limit, after) = (self.limit.map(|limit| list_limit(Some(limit))), path_of(self.cursor.as_deref())?);
+        files.retain(|file| file.path > after && self.wants(file));
+        let Some(limit) = limit.transpose()? else { return Ok((files, None)) };
+        let more = files.len() > limit as usize;
+        files.truncate(limit as usize);
+        let filters = [("kind", self.kind.clone()), ("path", self.path.clone()), ("warning", self.warning.clone())];
+        let next = files.last().filter(|_| more);
+        let next = next.map(|last| next_part(&with_filters(survey, &filters), limit, cursor_after(&last.path)));
+        Ok((files, next))
+    }
 }
 
 /// What a survey with these files lacks.
@@ -149,6 +198,8 @@ pub async fn list(
 }
 
 /// One survey: its files, and what is missing
+///
+/// What is missing and how photos and reconstruction go together is told of all files, whichever are listed.
 #[utoipa::path(
     get,
     path = "/api/v1/plants/{plant}/surveys/{survey}",
@@ -169,15 +220,14 @@ pub async fn get(
     State(state): State<AppState>,
     ApiPath((plant, survey)): ApiPath<(PlantId, SurveyId)>,
     ApiQuery(query): ApiQuery<FilesQuery>,
-) -> Result<Json<SurveyDetail>, ApiError> {
-    let kinds = [FileKind::Image, FileKind::Reconstruction].map(FileKind::as_str);
-    if query.kind.as_deref().is_some_and(|kind| !kinds.contains(&kind)) {
-        return Err(ApiError::new(Code::InvalidQuery, format!("kind must be {}", kinds.join(" or "))));
-    }
+) -> Result<Response, ApiError> {
+    query.check()?;
     let survey = state.require_survey(plant, survey).await?;
     let files = state.store.files(survey.id).await?;
     let missing = missing_views(&files);
-    let (images, mut files) = images::summary(files);
-    files.retain(|file| query.kind.as_deref().is_none_or(|kind| file.kind == kind));
-    Ok(Json(SurveyDetail { survey: survey.into(), complete: missing.is_empty(), missing, images, files }))
+    let (images, files) = images::summary(files);
+    let (files, next) = query.part(&format!("/api/v1/plants/{plant}/surveys/{}", survey.id), files)?;
+    let link = next.as_deref().and_then(next_link).map(|link| [link]);
+    let complete = missing.is_empty();
+    Ok((link, Json(SurveyDetail { survey: survey.into(), complete, missing, images, files, next })).into_response())
 }

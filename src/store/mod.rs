@@ -153,8 +153,14 @@ pub trait Store: AccessStore + UploadStore + RequestStore + TaskStore + WebhookS
     async fn blobs(&self, after: Option<(PlantId, Digest)>, limit: u32) -> Result<Vec<BlobRecord>, StoreError>;
     /// One file of a survey.
     async fn file(&self, survey: SurveyId, path: &SurveyPath) -> Result<Option<FileRecord>, StoreError>;
-    /// A survey's photos sorted by path: at most `limit` of those after a text.
-    async fn photos(&self, survey: SurveyId, after: &str, limit: u32) -> Result<Vec<FileRecord>, StoreError>;
+    /// A survey's photos whose names begin with a prefix, sorted by path: at most `limit` of those after a text.
+    async fn photos(
+        &self,
+        survey: SurveyId,
+        prefix: &str,
+        after: &str,
+        limit: u32,
+    ) -> Result<Vec<FileRecord>, StoreError>;
     /// Where those of a survey's photos are whose bytes another one has, too, each with their digest; sorted.
     async fn photos_alike(&self, survey: SurveyId) -> Result<Vec<(Digest, SurveyPath)>, StoreError>;
     /// Where a survey's photos with these bytes are, sorted, at most `limit`.

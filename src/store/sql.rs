@@ -210,7 +210,8 @@ pub const FILE: &str = concat!("SELECT ", file!(), " FROM files WHERE survey_id 
 pub const PHOTOS: &str = concat!(
     "SELECT ",
     file!(),
-    " FROM files WHERE survey_id = $1 AND kind = 'image' AND path > $2 ORDER BY path LIMIT $3"
+    " FROM files WHERE survey_id = $1 AND kind = 'image' AND path > $2 AND SUBSTR(path, 1, LENGTH($4)) = $4 \
+     ORDER BY path LIMIT $3"
 );
 pub const PHOTOS_ALIKE: &str = "\
     SELECT sha256, path FROM files WHERE survey_id = $1 AND kind = 'image' AND sha256 IN (\

@@ -1,10 +1,10 @@
 //! What the pilot hears of the photos before leaving the field.
 
-use crate::app::{App, assert_problem};
+use crate::app::{App, assert_problem, json_of};
 use exif::experimental::Writer;
 use exif::{Field, In, Rational, Tag, Value as Exif};
 use image::{GrayImage, Luma};
-use reqwest::StatusCode;
+use reqwest::{Method, StatusCode};
 use serde_json::{Value, json};
 use std::io::Cursor;
 
@@ -92,20 +92,83 @@ async fn every_photo_has_its_verdict_at_once_and_in_the_list() {
     assert_eq!(names(&app, &format!("{images}?warning=blurred")).await, ["blurred.jpg"]);
     assert_eq!(names(&app, &format!("{images}?reconstructed=false")).await, [""; 0]);
 
+    assert_eq!(names(&app, &format!("{images}?name=good")).await, ["good again.jpg", "good.jpg"]);
+    assert_eq!(names(&app, &format!("{images}?name=good%20&warning=duplicate")).await, ["good again.jpg"]);
+    assert_eq!(names(&app, &format!("{images}?name=Good")).await, [""; 0]);
+    assert_eq!(names(&app, &format!("{images}?name=images/")).await, [""; 0]);
+    assert_eq!(names(&app, &format!("{images}?warning=none")).await, [""; 0]);
+
     // Part by part, the filter kept.
-    let (mut next, mut seen) = (format!("{images}?warning=any&limit=1"), Vec::new());
-    loop {
-        let (_, part) = app.get(&next).await;
-        seen.extend(part["items"].as_array().unwrap().iter().map(|image| image["name"].as_str().unwrap().to_owned()));
-        match part["next"].as_str() {
-            Some(link) => next = link.to_owned(),
-            None => break,
-        }
-    }
+    let seen = walked(&app, &format!("{images}?warning=any&limit=1"), "items", "name").await;
     assert_eq!(seen, ["blurred.jpg", "dark.png", "good again.jpg", "good.jpg"]);
+    let seen = walked(&app, &format!("{images}?name=good&limit=1"), "items", "name").await;
+    assert_eq!(seen, ["good again.jpg", "good.jpg"]);
     for query in ["warning=ugly", "cursor=x", "limit=0", "limit=1001", "reconstructed=maybe", "unknown=1"] {
         assert_problem(app.get(&format!("{images}?{query}")).await, 400, "invalid_query", "");
     }
+}
+
+/// What all parts of a list tell, one after the other; `limit` is 1.
+async fn walked(app: &App, first: &str, list: &str, member: &str) -> Vec<String> {
+    let (mut next, mut seen) = (first.to_owned(), Vec::new());
+    loop {
+        let answer = app.request(Method::GET, &next).send().await.unwrap();
+        let link = answer.headers().get("link").map(|link| link.to_str().unwrap().to_owned());
+        let (_, part) = json_of(answer).await;
+        let items = part[list].as_array().unwrap();
+        assert!(items.len() <= 1, "{part}");
+        seen.extend(items.iter().map(|item| item[member].as_str().unwrap().to_owned()));
+        match part["next"].as_str() {
+            Some(told) => next = told.to_owned(),
+            None => return seen,
+        }
+        assert_eq!(link, Some(format!("<{next}>; rel=\"next\"")));
+    }
+}
+
+#[tokio::test]
+async fn the_files_of_a_survey_are_told_in_part() {
+    let app = App::new(&[]).await;
+    let survey = flown(&app).await;
+    app.put(&format!("{survey}/reconstruction/reconstruction.json"), "[{\"shots\": {}}]").await;
+    let undistorted = format!("{survey}/reconstruction/undistorted/images/good.jpg");
+    assert_eq!(app.put(&undistorted, photo(&picture(), 45)).await.0, StatusCode::CREATED);
+    let paths = async |query: &str| walked(&app, &format!("{survey}?limit=1&{query}"), "files", "path").await;
+    let photos = ["images/blurred.jpg", "images/dark.png", "images/good again.jpg", "images/good.jpg"];
+    let others = ["reconstruction.json", "undistorted/images/good.jpg"];
+    assert_eq!(paths("").await, [&photos[..], &others[..]].concat());
+    assert_eq!(paths("kind=image&path=images/good").await, photos[2..]);
+    assert_eq!(paths("path=undistorted/").await, others[1..]);
+    assert_eq!(paths("warning=any").await, photos);
+    assert_eq!(paths("warning=none").await, others);
+    assert_eq!(paths("warning=duplicate&path=images/good.").await, photos[3..]);
+    assert!(paths("path=elsewhere/").await.is_empty());
+    // Whatever is told of all files does not depend on which are listed.
+    let (_, whole) = app.get(&survey).await;
+    let (_, part) = app.get(&format!("{survey}?limit=1&path=undistorted/")).await;
+    for member in ["complete", "missing", "images"] {
+        assert_eq!(part[member], whole[member]);
+    }
+    assert_eq!((whole["files"].as_array().unwrap().len(), whole.get("next")), (6, None));
+
+    // What comes or changes between two parts moves nothing: what was there is told once.
+    let (_, first) = app.get(&format!("{survey}?warning=any&limit=2")).await;
+    put(&app, &survey, "a first one.jpg", photo(&picture(), 50)).await;
+    put(&app, &survey, "early.jpg", photo(&picture(), 15)).await;
+    let (status, answer) = app.put(&format!("{survey}/images/dark.png"), sharp_png()).await;
+    assert_eq!((status, &answer["result"]), (StatusCode::OK, &json!("replaced")), "{answer}");
+    let rest = walked(&app, &first["next"].as_str().unwrap().replace("limit=2", "limit=1"), "files", "path").await;
+    assert_eq!(rest, ["images/early.jpg", "images/good again.jpg", "images/good.jpg"]);
+    for query in ["warning=ugly", "cursor=x", "limit=0", "limit=1001", "kind=photo", "unknown=1"] {
+        assert_problem(app.get(&format!("{survey}?{query}")).await, 400, "invalid_query", "");
+    }
+}
+
+/// Without EXIF.
+fn sharp_png() -> Vec<u8> {
+    let mut png = Cursor::new(Vec::new());
+    picture().write_to(&mut png, image::ImageFormat::Png).unwrap();
+    png.into_inner()
 }
 
 #[tokio::test]
@@ -160,9 +223,7 @@ async fn a_survey_says_what_is_complete_and_what_is_missing() {
 async fn a_photo_that_does_not_decode_is_refused() {
     let app = App::new(&[]).await;
     let survey = app.survey().await;
-    let mut broken = Cursor::new(Vec::new());
-    picture().write_to(&mut broken, image::ImageFormat::Png).unwrap();
-    let mut broken = broken.into_inner();
+    let mut broken = sharp_png();
     // The chunks are whole, what is in them is not.
     let middle = broken.len() / 2;
     broken[middle..middle + 64].fill(0xaa);

@@ -198,8 +198,18 @@ impl Store for Rows {
         query.fetch_optional(&self.read).await?.as_ref().map(file).transpose()
     }
 
-    async fn photos(&self, survey: SurveyId, after: &str, limit: u32) -> Result<Vec<FileRecord>, StoreError> {
-        let query = sqlx::query(sql::PHOTOS).bind(survey.to_string()).bind(after).bind(i64::from(limit));
+    async fn photos(
+        &self,
+        survey: SurveyId,
+        prefix: &str,
+        after: &str,
+        limit: u32,
+    ) -> Result<Vec<FileRecord>, StoreError> {
+        let query = sqlx::query(sql::PHOTOS)
+            .bind(survey.to_string())
+            .bind(after)
+            .bind(i64::from(limit))
+            .bind(format!("images/{prefix}"));
         query.fetch_all(&self.read).await?.iter().map(file).collect()
     }
 

@@ -44,10 +44,13 @@ pub async fn photos_and_what_was_found_in_them(store: &dyn Store) {
     ];
     put(store, &survey, &others).await;
 
-    let first = store.photos(survey.id, "", 2).await.unwrap();
+    let first = store.photos(survey.id, "", "", 2).await.unwrap();
     let names = |photos: &[FileRecord]| photos.iter().map(|p| p.path.file_name().to_owned()).collect::<Vec<_>>();
     assert_eq!(names(&first), ["a.jpg", "b.jpg"]);
-    assert_eq!(names(&store.photos(survey.id, first[1].path.as_str(), 9).await.unwrap()), ["c.jpg"]);
+    assert_eq!(names(&store.photos(survey.id, "", first[1].path.as_str(), 9).await.unwrap()), ["c.jpg"]);
+    assert_eq!(names(&store.photos(survey.id, "b.", "", 9).await.unwrap()), ["b.jpg"]);
+    assert!(store.photos(survey.id, "B", "", 9).await.unwrap().is_empty());
+    assert!(store.photos(survey.id, "a", first[0].path.as_str(), 9).await.unwrap().is_empty());
     assert_eq!((&first[0].photo, &first[1].photo), (&None, &Some(facts)));
     let reconstruction = store.file(survey.id, &others[0].path).await.unwrap().unwrap();
     assert_eq!(reconstruction.shots, shots);
