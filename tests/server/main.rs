@@ -8,6 +8,7 @@ mod configuration;
 mod doctor;
 mod traces;
 
+use heliomap::store::Digest;
 use reqwest::StatusCode;
 use reqwest::blocking::Client;
 use serde_json::{Value, json};
@@ -82,8 +83,12 @@ fn listening(command: Command, log: impl Into<Stdio>) -> (Program, String) {
 }
 
 fn jpeg() -> Vec<u8> {
+    jpeg_of(16)
+}
+
+fn jpeg_of(width: u32) -> Vec<u8> {
     let mut bytes = std::io::Cursor::new(Vec::new());
-    image::RgbImage::new(16, 12).write_to(&mut bytes, image::ImageFormat::Jpeg).unwrap();
+    image::RgbImage::new(width, 12).write_to(&mut bytes, image::ImageFormat::Jpeg).unwrap();
     bytes.into_inner()
 }
 
@@ -135,6 +140,31 @@ fn what_was_acknowledged_survives_a_kill_and_the_program_stops_when_told() {
     let jobs: Value = client.get(format!("{base}{survey}/jobs")).send().unwrap().json().unwrap();
     assert_eq!((&jobs["items"][0]["id"], &jobs["items"][0]["state"]), (&job["id"], &json!("queued")));
     assert!(program.terminate().success());
+}
+
+#[test]
+fn the_bytes_of_replaced_files_go_after_their_time() {
+    let data = tempfile::tempdir().unwrap();
+    let client = client();
+    let (_server, base) = serve(data.path(), &["--no-worker", "--keep-replaced", "0.5"]);
+    let (survey, job) = broken_survey_with_job(&client, &base);
+    let kept_bytes = || {
+        let usage: Value = client.get(format!("{base}/api/v1/usage")).send().unwrap().json().unwrap();
+        usage["bytes"].as_u64().unwrap()
+    };
+    let (before, old, new) = (kept_bytes(), jpeg(), jpeg_of(80));
+    for name in ["a.jpg", "b.jpg"] {
+        let answer = client.put(format!("{base}{survey}/images/{name}")).body(new.clone()).send().unwrap();
+        assert_eq!(answer.status(), StatusCode::OK);
+    }
+    let digest = Digest::of(&old).to_string();
+    let plant = job["plant"].as_str().unwrap();
+    let blob = data.path().join(format!("blobs/plants/{plant}/{}/{digest}", &digest[..2]));
+    let begun = Instant::now();
+    while blob.exists() || kept_bytes() != before - old.len() as u64 + new.len() as u64 {
+        assert!(begun.elapsed() < Duration::from_secs(60), "they stay");
+        std::thread::sleep(Duration::from_millis(50));
+    }
 }
 
 #[test]
