@@ -95,7 +95,7 @@ fn uploads() -> OpenApiRouter<AppState> {
         .routes(routes!(uploads::post_images))
         .routes(routes!(uploads::put_reconstruction, uploads::post_reconstruction))
         .routes(routes!(uploads::put_reconstruction_file))
-        .routes(routes!(tus::begin::create, tus::options))
+        .routes(routes!(tus::begin::create, tus::list::list, tus::options))
         .routes(routes!(tus::head, tus::get, tus::append::patch, tus::terminate, tus::post))
 }
 

@@ -223,9 +223,13 @@ pub const PHOTOS_OF_DIGEST: &str = "\
 pub const CREATE_UPLOAD: &str = "\
     INSERT INTO uploads (id, survey_id, length, received, partial, metadata, expires_ms) \
     VALUES ($1, $2, $3, $4, $5, $6, $7)";
-pub const UPLOAD: &str = "\
-    SELECT id, survey_id, length, received, partial, metadata, expires_ms, outcome FROM uploads \
-    WHERE survey_id = $1 AND id = $2";
+macro_rules! upload {
+    () => {
+        "SELECT id, survey_id, length, received, partial, metadata, expires_ms, outcome FROM uploads WHERE survey_id = $1 AND "
+    };
+}
+pub const UPLOAD: &str = concat!(upload!(), "id = $2");
+pub const UPLOADS_OF_SURVEY: &str = concat!(upload!(), "id > $2 AND expires_ms > $4 ORDER BY id LIMIT $3");
 pub const UPLOAD_RECEIVED: &str = "UPDATE uploads SET received = $2, expires_ms = $3 WHERE id = $1";
 pub const END_UPLOAD: &str = "UPDATE uploads SET outcome = $2 WHERE id = $1";
 pub const DELETE_UPLOAD: &str = "DELETE FROM uploads WHERE survey_id = $1 AND id = $2";

@@ -36,6 +36,14 @@ pub trait UploadStore: Send + Sync + 'static {
     async fn create_upload(&self, upload: &Upload) -> Result<(), StoreError>;
     /// One upload to a survey, expired ones included.
     async fn upload(&self, survey: SurveyId, id: UploadId) -> Result<Option<Upload>, StoreError>;
+    /// A survey's uploads that are not expired, in the order of their identifiers: at most `limit` of those after a text.
+    async fn uploads_of_survey(
+        &self,
+        survey: SurveyId,
+        after: &str,
+        limit: u32,
+        now: Timestamp,
+    ) -> Result<Vec<Upload>, StoreError>;
     /// Notes how many bytes are safe, and a new end of its life; `false` where the upload is gone.
     async fn upload_received(&self, id: UploadId, received: u64, expires: Timestamp) -> Result<bool, StoreError>;
     /// Notes what became of the whole file, JSON.

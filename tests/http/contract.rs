@@ -49,6 +49,8 @@ async fn real_answers_are_as_described() {
         (format!("{plant}/models/latest"), "ModelDetail"),
         (format!("{plant}/models/1/modules?limit=1"), "FeatureCollection"),
         (format!("{plant}/models/1/lines"), "FeatureCollection"),
+        (format!("{survey}/uploads"), "List_UploadView"),
+        (format!("{survey}?limit=1"), "SurveyDetail"),
         ("/api/v1/plants/x".to_owned(), "Problem"),
     ] {
         let (_, answer) = app.get(&path).await;

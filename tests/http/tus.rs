@@ -260,6 +260,64 @@ async fn a_file_that_is_refused_says_why() {
 }
 
 #[tokio::test]
+async fn a_ground_station_finds_again_what_it_began() {
+    let app = App::new(&[]).await;
+    let survey = app.survey().await;
+    let uploads = format!("{survey}/uploads");
+    assert_eq!(app.get(&uploads).await.1, json!({"items": []}));
+    let photo = jpeg(64, 48);
+    let half = begin(&app, &survey, photo.len(), &metadata("filename", "half.jpg")).await;
+    more(&app, &half, 0, &photo[..100]).send().await.unwrap();
+    let whole = begin(&app, &survey, photo.len(), &metadata("filename", "whole.jpg")).await;
+    more(&app, &whole, 0, &photo).send().await.unwrap();
+    let broken = begin(&app, &survey, 7, &metadata("path", "reconstruction")).await;
+    more(&app, &broken, 0, b"no file").send().await.unwrap();
+    let part = tus(&app, Method::POST, &uploads).header("upload-concat", "partial").header("upload-length", 5);
+    let part = part.send().await.unwrap().headers()["location"].to_str().unwrap().to_owned();
+
+    let listed = async |query: &str| -> Vec<(String, Value)> {
+        let (mut next, mut seen) = (format!("{uploads}?limit=1&{query}"), Vec::new());
+        loop {
+            let (status, list) = app.get(&next).await;
+            assert_eq!((status, list["items"].as_array().unwrap().len() <= 1), (StatusCode::OK, true), "{list}");
+            let items = list["items"].as_array().unwrap().iter();
+            seen.extend(items.map(|item| (item["location"].as_str().unwrap().to_owned(), item.clone())));
+            match list["next"].as_str() {
+                Some(link) => next = link.to_owned(),
+                None => break,
+            }
+        }
+        seen.sort_by(|a, b| a.0.cmp(&b.0));
+        seen
+    };
+    let places = |list: &[(String, Value)]| list.iter().map(|(place, _)| place.clone()).collect::<Vec<_>>();
+    let sorted = |mut places: Vec<&String>| {
+        places.sort();
+        places.into_iter().cloned().collect::<Vec<_>>()
+    };
+    assert_eq!(places(&listed("").await), sorted(vec![&half, &whole, &broken, &part]));
+    let unfinished = listed("state=unfinished").await;
+    assert_eq!(places(&unfinished), sorted(vec![&half, &part]));
+    let (_, told) = unfinished.iter().find(|(place, _)| *place == half).unwrap();
+    assert_eq!((&told["path"], &told["offset"]), (&json!("images/half.jpg"), &json!(100)));
+    assert!(unfinished.iter().any(|(place, told)| *place == part && told.get("path").is_none()));
+    let refused = listed("state=refused").await;
+    assert_eq!((places(&refused), &refused[0].1["path"]), (vec![broken], &json!("reconstruction")));
+    assert_eq!(refused[0].1["outcome"]["problem"]["code"], "unsupported_archive");
+    let stored = listed("state=stored").await;
+    assert_eq!(
+        (places(&stored), &stored[0].1["outcome"]["files"][0]["path"]),
+        (vec![whole], &json!("images/whole.jpg"))
+    );
+    // And it goes on with what it found.
+    assert_eq!(more(&app, &half, 100, &photo[100..]).send().await.unwrap().status(), StatusCode::NO_CONTENT);
+    assert_eq!(places(&listed("state=unfinished").await), [part]);
+    for query in ["state=lost", "cursor=x", "limit=0", "unknown=1"] {
+        assert_problem(app.get(&format!("{uploads}?{query}")).await, 400, "invalid_query", "");
+    }
+}
+
+#[tokio::test]
 async fn wrong_requests_are_refused() {
     let app = App::new(&[]).await;
     let survey = app.survey().await;

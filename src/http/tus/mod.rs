@@ -7,6 +7,7 @@
 
 pub mod append;
 pub mod begin;
+pub mod list;
 
 mod desk;
 mod finish;
@@ -29,8 +30,10 @@ use axum::response::{IntoResponse, Response};
 use desk::Taken;
 use finish::{finish, remove};
 use jiff::{SignedDuration, Timestamp};
+use place::Place;
 use protocol::{ALGORITHMS, EXTENSIONS, UPLOAD_EXPIRES, UPLOAD_OFFSET, VERSION, answer, http_date, require_version};
 use serde::{Deserialize, Serialize};
+use std::str::FromStr;
 
 /// How long an upload lives after its last byte.
 const LIFE: SignedDuration = SignedDuration::from_hours(24);
@@ -55,6 +58,13 @@ pub struct UploadPath {
 pub struct UploadView {
     #[schema(value_type = Uuid)]
     pub id: UploadId,
+    /// Where its bytes go.
+    pub location: String,
+    /// The file's place in the survey's folder, or `reconstruction` where it is an archive; left out of a part of a file.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(example = "images/DJI_0001.jpg")]
+    pub path: Option<String>,
+    pub state: UploadState,
     /// Bytes of the whole file.
     pub length: u64,
     /// Bytes that are safe.
@@ -65,6 +75,57 @@ pub struct UploadView {
     /// What became of the whole file.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub outcome: Option<Outcome>,
+}
+
+/// Where an upload stands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, utoipa::ToSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum UploadState {
+    /// Bytes are missing or, of a part of a file, it was not put together yet.
+    Unfinished,
+    /// The file is in the survey.
+    Stored,
+    /// The file was refused; `outcome` tells why.
+    Refused,
+}
+
+impl FromStr for UploadState {
+    type Err = ();
+
+    fn from_str(word: &str) -> Result<Self, ()> {
+        match word {
+            "unfinished" => Ok(Self::Unfinished),
+            "stored" => Ok(Self::Stored),
+            "refused" => Ok(Self::Refused),
+            _ => Err(()),
+        }
+    }
+}
+
+impl UploadView {
+    fn of(plant: PlantId, upload: Upload) -> Result<Self, ApiError> {
+        let outcome: Option<Outcome> = upload
+            .outcome
+            .as_deref()
+            .map(serde_json::from_str)
+            .transpose()
+            .map_err(|error| ApiError::internal(&error))?;
+        Ok(Self {
+            id: upload.id,
+            location: place(plant, upload.survey, upload.id),
+            // What cannot be read was refused when the upload began, but where it is a part.
+            path: Place::of(&upload.metadata).ok().filter(|_| !upload.partial).map(|place| place.told().to_owned()),
+            state: match &outcome {
+                None => UploadState::Unfinished,
+                Some(Outcome { problem: None, .. }) => UploadState::Stored,
+                Some(_) => UploadState::Refused,
+            },
+            length: upload.length,
+            offset: upload.received,
+            expires: upload.expires,
+            outcome,
+        })
+    }
 }
 
 /// What became of a whole file: stored, or refused.
@@ -198,14 +259,7 @@ pub async fn get(
 ) -> Result<Json<UploadView>, ApiError> {
     state.require_survey(path.plant, path.survey).await?;
     let upload = require_upload(&state, path.survey, path.upload).await?;
-    let outcome = upload.outcome.as_deref().map(serde_json::from_str).transpose();
-    Ok(Json(UploadView {
-        id: upload.id,
-        length: upload.length,
-        offset: upload.received,
-        expires: upload.expires,
-        outcome: outcome.map_err(|error| ApiError::internal(&error))?,
-    }))
+    UploadView::of(path.plant, upload).map(Json)
 }
 
 /// End an upload and forget it (tus 1.0)

@@ -36,6 +36,14 @@ impl Place {
         }
     }
 
+    /// As a client tells it.
+    pub(super) fn told(&self) -> &str {
+        match self {
+            Self::File(path) => path.as_str(),
+            Self::Archive => ARCHIVE,
+        }
+    }
+
     pub(super) fn name(&self) -> &str {
         match self {
             Self::File(path) => path.as_str(),

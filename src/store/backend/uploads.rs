@@ -28,6 +28,21 @@ impl UploadStore for Rows {
         query.fetch_optional(&self.read).await?.as_ref().map(read::upload).transpose()
     }
 
+    async fn uploads_of_survey(
+        &self,
+        survey: SurveyId,
+        after: &str,
+        limit: u32,
+        now: Timestamp,
+    ) -> Result<Vec<Upload>, StoreError> {
+        let query = sqlx::query(sql::UPLOADS_OF_SURVEY)
+            .bind(survey.to_string())
+            .bind(after)
+            .bind(i64::from(limit))
+            .bind(now.as_millisecond());
+        query.fetch_all(&self.read).await?.iter().map(read::upload).collect()
+    }
+
     async fn upload_received(&self, id: UploadId, received: u64, expires: Timestamp) -> Result<bool, StoreError> {
         let query = sqlx::query(sql::UPLOAD_RECEIVED).bind(id.to_string()).bind(received as i64);
         Ok(query.bind(expires.as_millisecond()).execute(&self.write).await?.rows_affected() > 0)

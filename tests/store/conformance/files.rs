@@ -82,6 +82,19 @@ pub async fn uploads(store: &dyn Store) {
     store.end_upload(id, "{}").await.unwrap();
     (upload.received, upload.expires, upload.outcome) = (1 << 33, at(200), Some("{}".to_owned()));
     assert_eq!(store.upload(survey.id, id).await.unwrap(), Some(upload.clone()));
+    let ids = (1..=3).map(|number| UploadId(Uuid::from_u128(number << 64))).collect::<Vec<_>>();
+    for (id, expires) in ids.iter().zip([150, 150, 100]) {
+        let another = Upload { id: *id, received: 0, outcome: None, expires: at(expires), ..upload.clone() };
+        store.create_upload(&another).await.unwrap();
+    }
+    let listed = async |after: String, limit, now| -> Vec<UploadId> {
+        let found = store.uploads_of_survey(survey.id, &after, limit, at(now)).await.unwrap();
+        found.iter().map(|upload| upload.id).collect()
+    };
+    assert_eq!(listed(String::new(), 9, 99).await, [id, ids[0], ids[1], ids[2]]);
+    assert_eq!(listed(String::new(), 2, 99).await, [id, ids[0]]);
+    assert_eq!(listed(ids[0].to_string(), 9, 100).await, [ids[1]], "the last one's time is over");
+    assert!(store.uploads_of_survey(SurveyId(Uuid::nil()), "", 9, at(0)).await.unwrap().is_empty());
     store.delete_expired_uploads(at(199)).await.unwrap();
     assert_eq!(store.uploads().await.unwrap(), [id]);
     store.delete_expired_uploads(at(200)).await.unwrap();
