@@ -232,8 +232,10 @@ impl Worker {
             Ok::<_, AttemptError>((bytes, layers, model.warnings))
         });
         let (bytes, layers, warnings) = mapping.await.map_err(|_| AttemptError::Panicked)??;
-        let size = bytes.len() as u64;
-        let sha256 = self.blobs.put_bytes(job.plant, bytes).await?;
+        let (sha256, size) = (Digest::of(&bytes), bytes.len() as u64);
+        // Where the job does not come to its end, the model is one of the blobs that nothing names.
+        self.store.reserve_model(job.plant, (sha256, size), Timestamp::now()).await?;
+        self.blobs.put_bytes(job.plant, bytes).await?;
         let pace = watch.pace();
         if let Some(pace) = &pace {
             self.metrics.mapped(&pace.stage_ms);

@@ -65,6 +65,9 @@ pub trait UsageStore: Send + Sync + 'static {
         now: Timestamp,
     ) -> Result<(), StoreError>;
 
+    /// Counts a model that is about to be stored in a plant, which no quota forbids; else as [`Self::reserve_bytes`].
+    async fn reserve_model(&self, plant: PlantId, model: (Digest, u64), now: Timestamp) -> Result<(), StoreError>;
+
     /// Takes blobs that have been unused since before a time, so that their bytes can be deleted: of each of at most `limit`
     /// plants at most as many, and none of a plant of which a job runs, for that may still read them. Until it is told that
     /// one is gone nobody may reserve or name it; where that is not told within `lease`, it is taken again.

@@ -74,6 +74,7 @@ on_both!(
     blobs_that_rows_name,
     what_nothing_names_any_more_is_freed,
     bytes_that_come_again_are_kept,
+    a_model_that_no_row_came_to_name_is_freed,
     bytes_that_a_job_may_read_are_kept,
     the_last_name_counts_whoever_is_last,
     images_of_a_job_are_shared,

@@ -56,6 +56,13 @@ impl UsageStore for Rows {
         Ok(())
     }
 
+    async fn reserve_model(&self, plant: PlantId, model: (Digest, u64), now: Timestamp) -> Result<(), StoreError> {
+        let mut tx = self.begin().await?;
+        count_bytes(&mut tx, plant, &[model], Some(now)).await?;
+        tx.commit().await?;
+        Ok(())
+    }
+
     async fn take_unused_blobs(
         &self,
         before: Timestamp,

@@ -2,7 +2,7 @@
 
 use super::{LEASE, ORGANISATION, at, claim, enqueue, file, model, plant, put, reserve, survey};
 use heliomap::plant::PlantId;
-use heliomap::store::{Digest, Ending, FileRecord, Store, StoreError, UnusedBlob};
+use heliomap::store::{Digest, Ending, FileRecord, Quotas, Store, StoreError, UnusedBlob};
 
 /// `images/NAME` with this content, stored at a time.
 fn photo(name: &str, content: &str, stored: i64) -> FileRecord {
@@ -78,6 +78,23 @@ pub async fn bytes_that_come_again_are_kept(store: &dyn Store) {
     let late = store.put_files(june.id, &[photo("3", "lost", 110)]).await;
     assert!(matches!(late, Err(StoreError::BeingFreed { .. })), "{late:?}");
     assert_eq!(store.files(june.id).await.unwrap().len(), 2);
+}
+
+pub async fn a_model_that_no_row_came_to_name_is_freed(store: &dyn Store) {
+    let june = survey(store, plant(store, "A").await.id, "June").await;
+    let lost = (Digest::of(b"lost"), 4);
+    let quota = Quotas { bytes: Some(1), plants: None };
+    store.set_quotas(ORGANISATION, quota).await.unwrap();
+    store.reserve_model(june.plant, lost, at(1)).await.unwrap();
+    store.reserve_model(june.plant, (Digest::of(b"model"), 5), at(1)).await.unwrap();
+    assert_eq!(bytes(store).await, 9, "no quota forbids it");
+    enqueue(store, &june).await;
+    let running = claim(store, 2).await.unwrap();
+    store.complete_job(&running, &model(june.plant, 1, 1), at(3)).await.unwrap();
+    assert_eq!(bytes(store).await, 9, "it counts once");
+    assert_eq!(contents(&take(store, 100, 100).await), [(june.plant, lost.0)]);
+    let nowhere = store.reserve_model(PlantId(uuid::Uuid::nil()), lost, at(1)).await;
+    assert!(matches!(nowhere, Err(StoreError::Gone { what: "plant" })), "{nowhere:?}");
 }
 
 pub async fn bytes_that_a_job_may_read_are_kept(store: &dyn Store) {
