@@ -18,7 +18,7 @@ use heliomap::config::{DetectorArgs, JobArgs, Limits, MetricsArgs, RetentionArgs
 use heliomap::http;
 use heliomap::jobs::{PipelineMapper, Worker, WorkerSettings};
 use heliomap::store::freeing::free_unused;
-use heliomap::store::{Blobs, PostgresStore, SqliteStore, Store};
+use heliomap::store::{Blobs, PostgresStore, SqliteStore, Store, StoreError};
 use heliomap::telemetry::metrics::{self, Metrics, Scrape};
 use heliomap::webhooks::{Sender, SenderSettings};
 use jiff::Timestamp;
@@ -37,8 +37,8 @@ const STALE_UPLOADS: Duration = Duration::from_secs(24 * 3600);
 /// Messages to webhooks are forgotten so long after they arrived or were given up.
 const OLD_DELIVERIES: Duration = Duration::from_secs(30 * 24 * 3600);
 
-/// How often, at the least, it is looked for bytes that nothing needs any more.
-const FREE_EVERY: Duration = Duration::from_secs(600);
+/// How often, at the least, it is looked for what is over.
+const TIDY_EVERY: Duration = Duration::from_secs(600);
 
 /// How long work in progress may take to end once the process was told to stop.
 const GRACE: Duration = Duration::from_secs(20);
@@ -75,16 +75,21 @@ async fn open_storage(args: &StorageArgs) -> anyhow::Result<(Arc<dyn Store>, Blo
         Some(url) => Arc::new(PostgresStore::open(url).await.context("cannot use the database of --database")?),
         None => Arc::new(SqliteStore::open(&folder.join("heliomap.db")).await.with_context(hint)?),
     };
+    forget_what_is_over(&*store, &blobs).await.with_context(hint)?;
+    Ok((store, blobs))
+}
+
+/// Forgets what has had its time, and deletes what belonged to it.
+async fn forget_what_is_over(store: &dyn Store, blobs: &Blobs) -> Result<(), StoreError> {
     store.delete_expired_uploads(Timestamp::now()).await?;
     store.forget_old_requests(Timestamp::now()).await?;
     store.forget_old_deliveries(Timestamp::now() - OLD_DELIVERIES).await?;
-    blobs.sweep_uploads(store.uploads().await?.into_iter().collect(), STALE_UPLOADS).await.with_context(hint)?;
+    blobs.sweep_uploads(store.uploads().await?.into_iter().collect(), STALE_UPLOADS).await?;
     // A plant may have been deleted without its blobs, or while some were still coming.
     for plant in store.deleted_plants().await? {
         blobs.delete_plant(plant).await?;
     }
-    store.forget_deleted_plants(Timestamp::now() - STALE_UPLOADS).await?;
-    Ok((store, blobs))
+    store.forget_deleted_plants(Timestamp::now() - STALE_UPLOADS).await
 }
 
 /// A worker that runs the pipeline.
@@ -127,20 +132,23 @@ fn send_messages(
     })
 }
 
-/// Deletes bytes that nothing needs any more beside what else the process does, until it stops.
-fn free_bytes(args: &RetentionArgs, store: &Arc<dyn Store>, blobs: &Blobs, stop: &CancellationToken) {
+/// Deletes what is over, and bytes that nothing needs any more, beside what else the process does, until it stops.
+fn keep_tidy(args: &RetentionArgs, store: &Arc<dyn Store>, blobs: &Blobs, stop: &CancellationToken) {
     let (store, blobs, stop, kept) = (store.clone(), blobs.clone(), stop.clone(), args.keep_replaced);
     tokio::spawn(async move {
         loop {
-            let before = Timestamp::now().checked_sub(kept).unwrap_or(Timestamp::MIN);
-            match free_unused(&*store, &blobs, before).await {
+            let tidied = async {
+                forget_what_is_over(&*store, &blobs).await?;
+                free_unused(&*store, &blobs, Timestamp::now().checked_sub(kept).unwrap_or(Timestamp::MIN)).await
+            };
+            match tidied.await {
                 Ok(0) => {}
                 Ok(freed) => tracing::info!(blobs = freed, "bytes that nothing needs any more are deleted"),
-                Err(error) => tracing::warn!(%error, "bytes that nothing needs any more cannot be deleted now"),
+                Err(error) => tracing::warn!(%error, "what is over cannot be deleted now"),
             }
             tokio::select! {
                 () = stop.cancelled() => return,
-                () = tokio::time::sleep(FREE_EVERY.min(kept)) => {}
+                () = tokio::time::sleep(TIDY_EVERY.min(kept)) => {}
             }
         }
     });

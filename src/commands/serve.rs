@@ -1,6 +1,6 @@
 //! `heliomap serve`: the HTTP API and the web page, with a worker inside.
 
-use super::{GRACE, free_bytes, open_storage, pipeline_worker, run_async, send_messages, serve_metrics, stop_signal};
+use super::{GRACE, keep_tidy, open_storage, pipeline_worker, run_async, send_messages, serve_metrics, stop_signal};
 use anyhow::Context;
 use heliomap::config::ServeArgs;
 use heliomap::http::{self, AppState};
@@ -42,7 +42,7 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
         let (metrics, bell) = (state.metrics.clone(), state.bell.clone());
         let scrape = Scrape { metrics: metrics.clone(), store: store.clone(), blobs: blobs.clone() };
         let sending = send_messages(&args.webhooks, &store, &metrics, &stop);
-        free_bytes(&args.retention, &store, &blobs, &stop);
+        keep_tidy(&args.retention, &store, &blobs, &stop);
         let worker = pipeline_worker(store.clone(), blobs, args.detector, &args.jobs, metrics, bell);
         let worker_stop = stop.clone();
         let working = (!args.no_worker).then(|| tokio::spawn(async move { worker.run(worker_stop).await }));

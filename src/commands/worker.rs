@@ -1,6 +1,6 @@
 //! `heliomap worker`: jobs in a process of their own.
 
-use super::{GRACE, free_bytes, open_storage, pipeline_worker, run_async, send_messages, serve_metrics, stop_signal};
+use super::{GRACE, keep_tidy, open_storage, pipeline_worker, run_async, send_messages, serve_metrics, stop_signal};
 use heliomap::config::WorkerArgs;
 use heliomap::telemetry::metrics::{Metrics, Scrape};
 use std::sync::Arc;
@@ -14,7 +14,7 @@ pub fn run(args: WorkerArgs) -> anyhow::Result<()> {
         let metrics = Metrics::default();
         let scrape = Scrape { metrics: metrics.clone(), store: store.clone(), blobs: blobs.clone() };
         let sending = send_messages(&args.webhooks, &store, &metrics, &stop);
-        free_bytes(&args.retention, &store, &blobs, &stop);
+        keep_tidy(&args.retention, &store, &blobs, &stop);
         let worker = pipeline_worker(store, blobs, args.detector, &args.jobs, metrics, Arc::new(Notify::new()));
         println!("heliomap works on jobs in {}", args.storage.data_dir.display());
         serve_metrics(&args.metrics, scrape, &stop).await?;

@@ -188,7 +188,10 @@ pub struct ImagesQuery {
     pub name: Option<String>,
     /// Only photos with this warning: `blurred`, `underexposed`, `overexposed`, `no_position`, `no_time`, `duplicate`, or
     /// `any`; or with `none`.
-    #[param(example = "blurred")]
+    #[param(
+        pattern = "^(blurred|underexposed|overexposed|no_position|no_time|duplicate|any|none)$",
+        example = "blurred"
+    )]
     pub warning: Option<String>,
     /// Only photos from which the reconstruction was made (`true`) or was not (`false`).
     pub reconstructed: Option<bool>,

@@ -99,7 +99,7 @@ pub struct FilesQuery {
     pub path: Option<String>,
     /// Only files with this warning: `blurred`, `underexposed`, `overexposed`, `no_position`, `no_time`, `duplicate`, or
     /// `any`; or with `none`, as all have that are no photos.
-    #[param(example = "any")]
+    #[param(pattern = "^(blurred|underexposed|overexposed|no_position|no_time|duplicate|any|none)$", example = "any")]
     pub warning: Option<String>,
 }
 

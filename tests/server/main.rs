@@ -8,7 +8,8 @@ mod configuration;
 mod doctor;
 mod traces;
 
-use heliomap::store::Digest;
+use heliomap::store::{Digest, SqliteStore, SurveyId, Upload, UploadId, UploadStore};
+use jiff::SignedDuration;
 use reqwest::StatusCode;
 use reqwest::blocking::Client;
 use serde_json::{Value, json};
@@ -16,6 +17,7 @@ use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
+use uuid::Uuid;
 
 /// Sends requests.
 fn client() -> Client {
@@ -165,6 +167,41 @@ fn the_bytes_of_replaced_files_go_after_their_time() {
         assert!(begun.elapsed() < Duration::from_secs(60), "they stay");
         std::thread::sleep(Duration::from_millis(50));
     }
+}
+
+/// Not only when the service starts.
+#[test]
+fn uploads_whose_time_is_over_are_forgotten_while_the_service_runs() {
+    let data = tempfile::tempdir().unwrap();
+    let client = client();
+    let (_server, base) = serve(data.path(), &["--no-worker", "--keep-replaced", "0.5"]);
+    let (survey, _) = broken_survey_with_job(&client, &base);
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let store = runtime.block_on(SqliteStore::open(&data.path().join("heliomap.db"))).unwrap();
+    let upload = |id: u128, expires: SignedDuration| Upload {
+        id: UploadId(Uuid::from_u128(id)),
+        survey: SurveyId(survey.rsplit('/').next().unwrap().parse().unwrap()),
+        length: 9,
+        received: 0,
+        partial: false,
+        metadata: "filename YS5qcGc=".to_owned(),
+        expires: jiff::Timestamp::now() + expires,
+        outcome: None,
+    };
+    let over = upload(1, SignedDuration::from_secs(-1));
+    let goes_on = upload(2, SignedDuration::from_hours(1));
+    let file = |upload: &Upload| data.path().join("uploads").join(upload.id.to_string());
+    for upload in [&over, &goes_on] {
+        runtime.block_on(store.create_upload(upload)).unwrap();
+        let made = std::fs::File::create(file(upload)).unwrap();
+        made.set_modified(std::time::SystemTime::now() - Duration::from_secs(90_000)).unwrap();
+    }
+    let begun = Instant::now();
+    while file(&over).exists() || runtime.block_on(store.uploads()).unwrap() != [goes_on.id] {
+        assert!(begun.elapsed() < Duration::from_secs(60), "it stays");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+    assert!(file(&goes_on).exists());
 }
 
 #[test]
