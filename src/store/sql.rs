@@ -95,16 +95,18 @@ macro_rules! unnamed {
          AND NOT EXISTS (SELECT 1 FROM models WHERE models.plant_id = blobs.plant_id AND models.sha256 = blobs.sha256)"
     };
 }
-macro_rules! without_job {
+/// Once somebody has begun to delete a blob, a job that began later cannot need it.
+macro_rules! needed_by_no_job {
     () => {
-        "NOT EXISTS (SELECT 1 FROM jobs WHERE jobs.plant_id = blobs.plant_id AND jobs.state = 'running')"
+        "(freeing_ms IS NOT NULL \
+         OR NOT EXISTS (SELECT 1 FROM jobs WHERE jobs.plant_id = blobs.plant_id AND jobs.state = 'running'))"
     };
 }
 pub const UNNAME_BLOB: &str =
     concat!("UPDATE blobs SET unused_ms = $3 WHERE plant_id = $1 AND sha256 = $2 AND ", unnamed!());
 pub const PLANTS_WITH_UNUSED_BLOBS: &str = concat!(
     "SELECT DISTINCT plant_id AS id FROM blobs WHERE unused_ms < $1 AND (freeing_ms IS NULL OR freeing_ms < $2) AND ",
-    without_job!(),
+    needed_by_no_job!(),
     " ORDER BY plant_id LIMIT $3"
 );
 pub const TAKE_UNUSED_BLOBS: &str = concat!(
@@ -112,7 +114,7 @@ pub const TAKE_UNUSED_BLOBS: &str = concat!(
      WHERE plant_id = $1 AND unused_ms < $2 AND (freeing_ms IS NULL OR freeing_ms < $3) AND ",
     unnamed!(),
     " AND ",
-    without_job!(),
+    needed_by_no_job!(),
     " ORDER BY sha256 LIMIT $4) RETURNING plant_id, sha256, size"
 );
 pub const FORGET_BLOB: &str =

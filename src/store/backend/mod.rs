@@ -432,8 +432,6 @@ impl Store for Rows {
             return Ok(Completed::Outdated);
         };
         let stored = model(&row)?;
-        // A model counts, and no quota keeps a job from its end.
-        usage::count_bytes(&mut tx, claim.job.plant, &[(new.sha256, new.size)], None).await?;
         for layer in &new.layers {
             let extents = || layer.features.iter().filter_map(|feature| feature.extent);
             let extent = extents().reduce(GeoBox::union);
@@ -456,6 +454,8 @@ impl Store for Rows {
                 first += features.len() as i64;
             }
         }
+        // A model counts, and no quota keeps a job from its end. Those who upload to the plant wait from here on.
+        usage::count_bytes(&mut tx, claim.job.plant, &[(new.sha256, new.size)], None).await?;
         sweep(&mut tx).await?;
         announce(&mut tx, claim.job.id, now).await?;
         tx.commit().await?;
