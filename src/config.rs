@@ -207,15 +207,15 @@ pub struct OpenapiArgs {
 #[derive(Clone, Args)]
 pub struct StorageArgs {
     /// Folder of the database and the uploaded files; created where it is missing.
-    #[arg(long, env = "HELIOMAP_DATA_DIR", default_value = "heliomap-data", value_name = "DIR")]
+    #[arg(long, env = "HELIOMAP_DATA_DIR", default_value = "heliomap-data", global = true, value_name = "DIR")]
     pub data_dir: PathBuf,
     /// Postgres database to use in place of the SQLite file in the data folder, `postgres://USER:PASSWORD@HOST/NAME`.
-    #[arg(long, env = "HELIOMAP_DATABASE", hide_env_values = true, value_name = "URL")]
+    #[arg(long, env = "HELIOMAP_DATABASE", hide_env_values = true, global = true, value_name = "URL")]
     pub database: Option<String>,
     /// Place in an S3-compatible store for the uploaded files and the models, in place of the data folder,
     /// `s3://BUCKET/PREFIX`. Endpoint, region and credentials come from the variables AWS_ENDPOINT_URL, AWS_REGION,
     /// AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and the others that programs for S3 take.
-    #[arg(long, env = "HELIOMAP_BLOBS", value_name = "URL")]
+    #[arg(long, env = "HELIOMAP_BLOBS", global = true, value_name = "URL")]
     pub blobs: Option<Bucket>,
 }
 
@@ -227,11 +227,14 @@ impl std::fmt::Debug for StorageArgs {
     }
 }
 
+/// The detector where none is named.
+const DETECTOR: &str = "both";
+
 /// What finds modules in photos.
 #[derive(Debug, Clone, Args)]
 pub struct DetectorArgs {
     /// The detector: `unet`, `yolo` or `both` (they come with heliomap), or ONNX files of your own, one of each kind at most.
-    #[arg(long, env = "HELIOMAP_DETECTOR", default_value = "both", value_delimiter = ',', value_name = "DETECTOR")]
+    #[arg(long, env = "HELIOMAP_DETECTOR", default_value = DETECTOR, value_delimiter = ',', value_name = "DETECTOR")]
     pub detector: Vec<String>,
     /// What runs the detector: cpu, or cuda, tensorrt, migraphx, openvino, xnnpack, coreml, directml where
     /// your ONNX Runtime (ORT_DYLIB_PATH) was built with it.
@@ -240,6 +243,13 @@ pub struct DetectorArgs {
 }
 
 impl DetectorArgs {
+    /// Whether models, what runs them, or ONNX Runtime's library were chosen, and not left as they are.
+    pub fn is_own(&self) -> bool {
+        self.detector != [DETECTOR]
+            || self.execution_provider != ExecutionProvider::default()
+            || std::env::var_os("ORT_DYLIB_PATH").is_some_and(|path| !path.is_empty())
+    }
+
     /// Opens the detector, which runs on so many threads; 0 is one per core.
     ///
     /// # Errors

@@ -3,10 +3,12 @@
 mod commands;
 
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
+use commands::output::tell;
 use heliomap::config::{
     BackupArgs, DoctorArgs, KeysArgs, LogArgs, OpenapiArgs, OrganisationsArgs, RestoreArgs, ServeArgs, TraceArgs,
     VerifyArgs, WorkerArgs, file,
 };
+use std::process::ExitCode;
 
 /// Maps photovoltaic plants from drone overview photos: every module georeferenced, with its place in the plant.
 #[derive(Debug, Parser)]
@@ -54,14 +56,36 @@ enum Command {
     Configuration,
 }
 
-fn main() -> anyhow::Result<()> {
-    let cli = parse()?;
+fn main() -> ExitCode {
+    match parse().and_then(traced) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            tell(report(&error));
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn traced(cli: Cli) -> anyhow::Result<()> {
     let traces = heliomap::telemetry::init(&cli.log, &cli.traces)?;
     let outcome = run(cli.command);
     if let Some(traces) = traces {
         traces.end();
     }
     outcome
+}
+
+/// An error for people: what failed, and of what caused it all that was not said yet. Most are mistakes of people, whom no
+/// backtrace helps.
+fn report(error: &anyhow::Error) -> String {
+    let mut said = format!("Error: {error}");
+    for cause in error.chain().skip(1).map(ToString::to_string) {
+        if !said.contains(&cause) {
+            said.push_str("\n  because: ");
+            said.push_str(&cause);
+        }
+    }
+    said
 }
 
 fn run(command: Command) -> anyhow::Result<()> {
@@ -79,10 +103,7 @@ fn run(command: Command) -> anyhow::Result<()> {
         Command::Evaluate(args) => commands::evaluate::run(&args),
         Command::Doctor(args) => commands::doctor::run(args),
         Command::Openapi(args) => commands::openapi::run(&args),
-        Command::Configuration => {
-            commands::configuration::run(&Cli::command());
-            Ok(())
-        }
+        Command::Configuration => commands::configuration::run(&Cli::command()),
     }
 }
 
@@ -99,6 +120,15 @@ fn parse() -> anyhow::Result<Cli> {
 mod tests {
     use super::*;
     use heliomap::config::Limits;
+
+    #[test]
+    fn what_was_said_is_not_said_again() {
+        let cause = std::io::Error::from(std::io::ErrorKind::NotFound);
+        let error = anyhow::anyhow!("a.jpg cannot be read: {cause}");
+        let chain = anyhow::Error::from(cause).context("opening the door").context("getting in: opening the door");
+        assert_eq!(report(&error), "Error: a.jpg cannot be read: entity not found");
+        assert_eq!(report(&chain), "Error: getting in: opening the door\n  because: entity not found");
+    }
 
     #[test]
     fn the_command_line_is_consistent() {

@@ -91,7 +91,7 @@ pub fn map_folder(
             let chosen = images::resolving(&project, &gsd_m, options, &mut warnings);
             images::search(&project, &chosen, &gsd_m, detector, options.max_image_pixels, &mut clock)?
         }
-        Boxes::File(path) => images::from_boxes(&project, path, &mut clock, &mut warnings)?,
+        Boxes::File(path) => images::from_boxes(&project, path, &gsd_m, options, &mut clock, &mut warnings)?,
     };
     let found = images::modules_in(&seen, &mut warnings)?;
 

@@ -1,6 +1,7 @@
 //! `heliomap backup`, `restore` and `verify`: what the service remembers, put aside and taken back, every blob checked.
 
-use super::{open_blobs, open_storage, run_async};
+use super::output::print;
+use super::{ROWS, open_blobs, open_storage_there, run_async};
 use anyhow::{Context, bail, ensure};
 use futures::{Stream, TryStreamExt, stream};
 use heliomap::config::{BackupArgs, RestoreArgs, StorageArgs, VerifyArgs};
@@ -11,8 +12,6 @@ use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 use std::pin::pin;
 
-/// The rows, in a backup as in a data folder.
-const ROWS: &str = "heliomap.db";
 /// Written last: a backup without it is not whole.
 const MANIFEST: &str = "backup.json";
 /// Blobs that are looked up at once.
@@ -74,8 +73,7 @@ pub fn backup(args: BackupArgs) -> anyhow::Result<()> {
             Manifest { version: env!("CARGO_PKG_VERSION").to_owned(), created: Timestamp::now(), blobs: count, bytes };
         write_synced(&folder.join(MANIFEST), &serde_json::to_vec_pretty(&manifest)?)?;
         sync(folder)?;
-        println!("{count} blobs of {bytes} bytes and their rows are in {}", folder.display());
-        Ok(())
+        print(format_args!("{count} blobs of {bytes} bytes and their rows are in {}\n", folder.display()))
     })
 }
 
@@ -114,8 +112,7 @@ pub fn restore(args: RestoreArgs) -> anyhow::Result<()> {
         sync(&coming)?;
         std::fs::rename(&coming, &rows).with_context(|| format!("renaming {}", coming.display()))?;
         sync(data)?;
-        println!("{count} blobs and their rows are back, as of {}", manifest.created);
-        Ok(())
+        print(format_args!("{count} blobs and their rows are back, as of {}\n", manifest.created))
     })
 }
 
@@ -139,7 +136,7 @@ async fn take_blobs(store: &dyn Store, blobs: &Blobs, backup: &Path) -> anyhow::
 /// Checks that every blob that the rows name is there.
 pub fn verify(args: VerifyArgs) -> anyhow::Result<()> {
     run_async(async {
-        let (store, blobs) = open_storage(&args.storage).await?;
+        let (store, blobs) = open_storage_there(&args.storage).await?;
         let (blobs, content) = (&blobs, args.content);
         let looks = recorded(&*store).map_ok(|blob| async move {
             let fault = blobs.check(blob.plant, blob.sha256, blob.size, content).await?;
@@ -149,15 +146,14 @@ pub fn verify(args: VerifyArgs) -> anyhow::Result<()> {
         let count = looked.len();
         let wrong: Vec<String> = looked.into_iter().flatten().collect();
         for fault in wrong.iter().take(NAMED) {
-            println!("{fault}");
+            print(format_args!("{fault}\n"))?;
         }
         ensure!(
             wrong.is_empty(),
             "{} of {count} blobs are not as they were stored: put them back from a backup",
             wrong.len()
         );
-        println!("all {count} blobs are there");
-        Ok(())
+        print(format_args!("all {count} blobs are there\n"))
     })
 }
 

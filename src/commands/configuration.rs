@@ -1,5 +1,6 @@
 //! `heliomap configuration`: docs/CONFIGURATION.md, made from the command line as it is.
 
+use super::output::print;
 use clap::{Arg, ArgAction, Command};
 use heliomap::config::file::FLAG;
 use std::collections::BTreeMap;
@@ -37,8 +38,8 @@ These belong to one run of a command and are given as flags alone.
 ";
 
 /// Prints the page.
-pub fn run(command: &Command) {
-    print!("{}", document(command));
+pub fn run(command: &Command) -> anyhow::Result<()> {
+    print(document(command))
 }
 
 /// A flag as the page shows it, without the commands that take it.

@@ -1,5 +1,6 @@
 //! `heliomap detect`: photos in, boxes of modules out.
 
+use super::output::{Output, prepare_folder, tell};
 use anyhow::{Context, bail};
 use clap::Args;
 use heliomap::config::DetectorArgs;
@@ -10,7 +11,6 @@ use heliomap::pipeline;
 use heliomap::reconstruction::{Photo, photo};
 use image::RgbImage;
 use std::collections::HashSet;
-use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::sync_channel;
 use std::time::Instant;
@@ -69,6 +69,10 @@ struct Task {
 
 /// Runs the command.
 pub fn run(args: &DetectArgs) -> anyhow::Result<()> {
+    let output = args.out.as_deref().map_or(Ok(Output::Stdout), Output::named)?;
+    if let Some(folder) = &args.overlay {
+        prepare_folder(folder)?;
+    }
     let threads = args.threads.unwrap_or(0);
     rayon::ThreadPoolBuilder::new().num_threads(threads).build_global().context("starting the threads")?;
     let tasks = tasks(args)?;
@@ -81,7 +85,8 @@ pub fn run(args: &DetectArgs) -> anyhow::Result<()> {
         let gsd_m = scale_of(args.gsd.or(task.gsd_m), &task.photo, &picture, &*detector)?;
         let detections = detector.detect(&picture, gsd_m)?;
         if args.timings {
-            eprintln!("{}: {} modules, {:.2} s", task.photo.shot, detections.len(), begun.elapsed().as_secs_f64());
+            let seconds = begun.elapsed().as_secs_f64();
+            tell(format_args!("{}: {} modules, {seconds:.2} s", task.photo.shot, detections.len()));
         }
         if let Some(folder) = &args.overlay {
             let stem = Path::new(&task.photo.shot).file_stem().unwrap_or_default().to_string_lossy().into_owned();
@@ -97,17 +102,9 @@ pub fn run(args: &DetectArgs) -> anyhow::Result<()> {
         Ok(())
     })?;
     if args.timings {
-        eprintln!("{} photos: {:.2} s", tasks.len(), start.elapsed().as_secs_f64());
+        tell(format_args!("{} photos: {:.2} s", tasks.len(), start.elapsed().as_secs_f64()));
     }
-    let boxes = external::to_file(&results);
-    match &args.out {
-        Some(path) => super::map::write_json(path, &serde_json::to_value(&boxes)?)?,
-        None => {
-            let mut stdout = std::io::stdout().lock();
-            serde_json::to_writer(&mut stdout, &boxes)?;
-            writeln!(stdout)?;
-        }
-    }
+    output.write_json(&external::to_file(&results))?;
     let found: usize = results.iter().map(|image| image.detections.len()).sum();
     tracing::info!("{found} modules in {} photos", results.len());
     Ok(())
@@ -192,7 +189,7 @@ fn photos_in(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
 /// A photo whose pixels are taken as they are.
 pub fn photo_as_it_is(path: &Path, max_pixels: u64) -> anyhow::Result<Photo> {
     let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    let header = photo::inspect(path, &name, max_pixels)?;
+    let header = photo::inspect(path, &path.display().to_string(), max_pixels)?;
     let camera = Camera::pinhole(header.width_px, header.height_px, 1.0);
     Ok(Photo { shot: name, path: path.to_owned(), header, camera })
 }

@@ -1,7 +1,9 @@
 //! `heliomap doctor`: whether what the service needs is there and works, and what to do where it does not.
 
-use super::{GRACE, open_blobs, run_async};
+use super::output::print;
+use super::{GRACE, ROWS, open_blobs, run_async};
 use heliomap::config::{DoctorArgs, ServeArgs};
+use heliomap::detection::DetectionError;
 use heliomap::oidc::Oidc;
 use heliomap::plant::PlantId;
 use heliomap::store::schema::{Examined, Schema};
@@ -63,7 +65,7 @@ pub fn run(args: DoctorArgs) -> anyhow::Result<()> {
     run_async(async move {
         let checks = examine(&args.serve).await;
         if json {
-            println!("{}", serde_json::to_string_pretty(&checks)?);
+            print(format_args!("{}\n", serde_json::to_string_pretty(&checks)?))?;
         } else {
             for check in &checks {
                 let verdict = match check.verdict {
@@ -71,9 +73,9 @@ pub fn run(args: DoctorArgs) -> anyhow::Result<()> {
                     Verdict::Warning => "warning",
                     Verdict::Failed => "FAILED ",
                 };
-                println!("{verdict}  {}: {}", check.name, check.found);
+                print(format_args!("{verdict}  {}: {}\n", check.name, check.found))?;
                 if let Some(advice) = &check.advice {
-                    println!("         -> {advice}");
+                    print(format_args!("         -> {advice}\n"))?;
                 }
             }
         }
@@ -178,7 +180,7 @@ async fn database(args: &ServeArgs) -> Check {
             "check its address, name, user and password, and that it takes connections from this machine",
         ),
         None => {
-            let file = args.storage.data_dir.join("heliomap.db");
+            let file = args.storage.data_dir.join(ROWS);
             let what = file.display().to_string();
             if !file.exists() {
                 return Check::warning(NAME, format!("{what} is not there yet"), "the service makes it when it starts");
@@ -261,14 +263,23 @@ async fn detector(args: &ServeArgs) -> Check {
         let begun = Instant::now();
         let picture = RgbImage::from_fn(TRIAL_PX, TRIAL_PX, |x, y| image::Rgb([(x % 256) as u8, (y % 256) as u8, 90]));
         detector.detect(&picture, None)?;
-        Ok::<_, heliomap::detection::DetectionError>((detector.describe(), begun.elapsed()))
+        Ok::<_, DetectionError>((detector.describe(), begun.elapsed()))
     });
     match tried.await {
         Ok(Ok((described, took))) => {
             Check::ok(NAME, format!("{described}; looked at {TRIAL_PX} x {TRIAL_PX} pixels in {} ms", took.as_millis()))
         }
         Ok(Err(error)) => {
-            let advice = "jobs fail without it; set ORT_DYLIB_PATH to ONNX Runtime's library and --detector to models that are there";
+            let advice = match error {
+                DetectionError::RuntimeMissing
+                | DetectionError::RuntimeUnusable { .. }
+                | DetectionError::ProviderMissing { .. } => {
+                    "jobs fail without it; set ORT_DYLIB_PATH to the library of an ONNX Runtime that works here"
+                }
+                _ => {
+                    "jobs fail without it; ONNX Runtime works, so name models with --detector that are there and whole"
+                }
+            };
             Check::failed(NAME, error.to_string(), advice)
         }
         Err(_) => Check::failed(

@@ -1,8 +1,8 @@
 //! `heliomap evaluate`: a plant against a truth or any reference model.
 
-use anyhow::{Context, bail};
+use super::output::{Output, prepare_folder, print};
+use anyhow::bail;
 use heliomap::evaluation::{self, read_model};
-use std::io::Write;
 use std::path::PathBuf;
 
 /// Compare a plant with a truth or any reference model.
@@ -29,30 +29,28 @@ pub struct EvaluateArgs {
 
 /// Runs the comparison and prints it.
 pub fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
+    let json = args.json.as_deref().map(Output::named).transpose()?;
+    if let Some(folder) = &args.plots {
+        prepare_folder(folder)?;
+    }
     let truth = read_model(&args.truth, None)?;
     let plant = read_model(&args.plant, Some(truth.reference))?;
     let evaluation = evaluation::evaluate(&plant, &truth)?;
-    let to_stdout = args.json.as_ref().is_some_and(|path| path.as_os_str() == "-");
-    let mut stdout = std::io::stdout().lock();
-    if to_stdout {
-        serde_json::to_writer_pretty(&mut stdout, &evaluation)?;
-        writeln!(stdout)?;
-    } else {
-        write!(stdout, "{evaluation}")?;
-    }
-    if let Some(path) = args.json.as_ref().filter(|_| !to_stdout) {
-        let mut json = serde_json::to_vec_pretty(&evaluation)?;
-        json.push(b'\n');
-        std::fs::write(path, json).with_context(|| format!("cannot write {}", path.display()))?;
+    let to_stdout = json == Some(Output::Stdout);
+    match &json {
+        Some(Output::Stdout) => print(format_args!("{}\n", serde_json::to_string_pretty(&evaluation)?))?,
+        json => {
+            print(&evaluation)?;
+            json.as_ref().map_or(Ok(()), |json| json.write_json(&evaluation))?;
+        }
     }
     if let Some(folder) = &args.plots {
         let written = evaluation::write_plots(&evaluation, &plant, &truth, folder)?;
         if !to_stdout {
             let names: Vec<String> = written.iter().map(|path| path.display().to_string()).collect();
-            writeln!(stdout, "\nPlots: {}", names.join(", "))?;
+            print(format_args!("\nPlots: {}\n", names.join(", ")))?;
         }
     }
-    stdout.flush()?;
     if args.strict && !evaluation.is_flawless() {
         bail!(
             "{} missing, {} false, structure {}",

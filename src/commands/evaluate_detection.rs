@@ -1,6 +1,7 @@
 //! `heliomap evaluate-detection`: boxes against labelled photos.
 
 use super::detect::{parse_gsd, photo_as_it_is, scale_of};
+use super::output::{Output, prepare_folder, print};
 use anyhow::{Context, bail};
 use clap::Args;
 use heliomap::config::DetectorArgs;
@@ -9,7 +10,6 @@ use heliomap::evaluation::detection::{DetectionReport, LabelledPhoto, PhotoScore
 use heliomap::geometry::Quad;
 use heliomap::overlay;
 use heliomap::reconstruction::photo::DEFAULT_MAX_PIXELS;
-use std::io::Write;
 use std::path::{Path, PathBuf};
 
 /// Measure a detector, or a file of boxes, against labelled photos.
@@ -55,6 +55,10 @@ pub struct EvaluateDetectionArgs {
 
 /// Runs the comparison and prints it.
 pub fn run(args: &EvaluateDetectionArgs) -> anyhow::Result<()> {
+    let json = args.json.as_deref().map(Output::named).transpose()?;
+    if let Some(folder) = &args.overlay {
+        prepare_folder(folder)?;
+    }
     let threads = args.threads.unwrap_or(0);
     rayon::ThreadPoolBuilder::new().num_threads(threads).build_global().context("starting the threads")?;
     let mut labelled = Vec::new();
@@ -62,7 +66,7 @@ pub fn run(args: &EvaluateDetectionArgs) -> anyhow::Result<()> {
         labelled.extend(read_labels(path, args.images.as_deref())?);
     }
     let (given, detector) = match &args.detections {
-        Some(path) => (external::read(path)?, None),
+        Some(path) => (given_boxes(path)?, None),
         None => (Vec::new(), Some(args.detector.open(threads)?)),
     };
     let mut scores = Vec::with_capacity(labelled.len());
@@ -74,20 +78,26 @@ pub fn run(args: &EvaluateDetectionArgs) -> anyhow::Result<()> {
         (None, detector) => detector.as_ref().map_or_else(String::new, |detector| detector.describe()),
     };
     let report = DetectionReport::new(what, scores);
-    let mut stdout = std::io::stdout().lock();
-    if args.json.as_ref().is_some_and(|path| path.as_os_str() == "-") {
-        serde_json::to_writer_pretty(&mut stdout, &report)?;
-        writeln!(stdout)?;
-    } else {
-        if args.photos {
-            writeln!(stdout, "{}", report.photo_table())?;
-        }
-        write!(stdout, "{report}")?;
-        if let Some(path) = &args.json {
-            super::map::write_json(path, &serde_json::to_value(&report)?)?;
+    match &json {
+        Some(Output::Stdout) => print(format_args!("{}\n", serde_json::to_string_pretty(&report)?))?,
+        json => {
+            if args.photos {
+                print(format_args!("{}\n", report.photo_table()))?;
+            }
+            print(&report)?;
+            json.as_ref().map_or(Ok(()), |json| json.write_json(&report))?;
         }
     }
     Ok(())
+}
+
+/// The boxes of a file; those that cannot be used are told.
+fn given_boxes(path: &Path) -> anyhow::Result<Vec<ImageDetections>> {
+    let read = external::read(path)?;
+    for (image, count) in &read.left_out {
+        tracing::warn!("{count} boxes of {image} lie outside of it or have no area, and are left out");
+    }
+    Ok(read.images)
 }
 
 /// The score of one photo.

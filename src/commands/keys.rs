@@ -1,6 +1,7 @@
 //! `heliomap keys`: keys made by whoever runs the service, the first one of each organisation among them.
 
-use super::{open_storage, run_async};
+use super::output::{print, print_once, tell};
+use super::{open_storage, open_storage_there, run_async};
 use anyhow::{Context, bail};
 use heliomap::config::{KeysArgs, KeysCommand};
 use heliomap::plant::PlantId;
@@ -10,7 +11,10 @@ use jiff::{SignedDuration, Timestamp};
 /// Runs the command.
 pub fn run(args: KeysArgs) -> anyhow::Result<()> {
     run_async(async {
-        let (store, _) = open_storage(&args.storage).await?;
+        let (store, _) = match args.command {
+            KeysCommand::Create { .. } => open_storage(&args.storage).await?,
+            _ => open_storage_there(&args.storage).await?,
+        };
         let now = Timestamp::now();
         match args.command {
             KeysCommand::Create { name, scope, organisation, plant, days } => {
@@ -32,8 +36,12 @@ pub fn run(args: KeysArgs) -> anyhow::Result<()> {
                     expires: days.map(|days| now + SignedDuration::from_hours(24 * i64::from(days))),
                 };
                 let key = store.create_key(&new, now).await?;
-                eprintln!("key {} is made; its secret is shown this once:", key.id);
-                println!("{}", secret.reveal());
+                tell(format_args!("key {} is made; its secret is shown this once:", key.id));
+                if let Err(error) = print_once(format_args!("{}\n", secret.reveal())) {
+                    store.revoke_key(organisation, key.id, None, now).await?;
+                    return Err(error)
+                        .context(format!("nobody can have read the secret of key {}: it is revoked", key.id));
+                }
             }
             KeysCommand::List => {
                 let mut after = None;
@@ -42,14 +50,14 @@ pub fn run(args: KeysArgs) -> anyhow::Result<()> {
                     let Some(last) = keys.last() else { break };
                     after = Some(last.seq);
                     for key in &keys {
-                        println!("{}", line(key, now));
+                        print(format_args!("{}\n", line(key, now)))?;
                     }
                 }
             }
             KeysCommand::Revoke { id } => {
                 let key = key_of_any(&*store, id).await?;
                 store.revoke_key(key.organisation, id, None, now).await?;
-                eprintln!("key {id} ({}) opens nothing any more", key.name);
+                tell(format_args!("key {id} ({}) opens nothing any more", key.name));
             }
             KeysCommand::Rotate { id, grace_hours } => {
                 let key = key_of_any(&*store, id).await?;
@@ -57,8 +65,10 @@ pub fn run(args: KeysArgs) -> anyhow::Result<()> {
                 let until = now + SignedDuration::from_hours(i64::from(grace_hours));
                 let rotated = store.rotate_key(key.organisation, id, None, &secret.record(), until).await?;
                 rotated.with_context(|| format!("key {id} is revoked; make another with `heliomap keys create`"))?;
-                eprintln!("key {id} ({}) has a new secret, which is shown this once:", key.name);
-                println!("{}", secret.reveal());
+                tell(format_args!("key {id} ({}) has a new secret, which is shown this once:", key.name));
+                print_once(format_args!("{}\n", secret.reveal())).with_context(|| {
+                    format!("nobody can have read the new secret of key {id}: rotate it once more, or revoke it")
+                })?;
             }
         }
         Ok(())

@@ -1,6 +1,7 @@
 //! `heliomap map`: a folder in, a plant out, no server.
 
-use anyhow::{Context, bail};
+use super::output::{Output, prepare_folder, print, tell};
+use anyhow::{Context, bail, ensure};
 use clap::Args;
 use heliomap::config::DetectorArgs;
 use heliomap::overlay;
@@ -8,7 +9,8 @@ use heliomap::pipeline::{self, Boxes, MapOptions, Observer, Stage, Subject};
 use heliomap::plant::{Layer, PlantId, PlantModel};
 use heliomap::refinement::{Control, Method};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
-use serde_json::{Value, json};
+use serde_json::json;
+use std::fmt::Write;
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
@@ -21,7 +23,8 @@ use std::sync::{Arc, Mutex};
 pub struct MapArgs {
     /// Folder with the reconstruction and the images
     folder: PathBuf,
-    /// GeoJSON file of all modules to write; sectors, benches and lines come beside it with `--layers`
+    /// GeoJSON file of all modules to write, `-` for standard output; sectors, benches and lines come beside it with
+    /// `--layers`
     #[arg(short, long, value_name = "FILE", default_value = "plant.geojson")]
     out: PathBuf,
     /// Write sectors, benches and lines too, as FILE-sectors.geojson and so on
@@ -96,6 +99,7 @@ enum MethodArg {
 
 /// Runs the command.
 pub fn run(args: &MapArgs) -> anyhow::Result<()> {
+    let outputs = Outputs::named(args)?;
     let cores = std::thread::available_parallelism().map_or(2, usize::from);
     let threads = args.threads.unwrap_or(cores).max(1);
     rayon::ThreadPoolBuilder::new().num_threads(threads).build_global().context("starting the threads")?;
@@ -143,15 +147,11 @@ pub fn run(args: &MapArgs) -> anyhow::Result<()> {
     report.finish();
 
     let model = &mapping.model;
-    write_json(&args.out, &model.feature_collection(Layer::Modules))?;
-    if args.layers {
-        let stem = args.out.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-        for layer in [Layer::Sectors, Layer::Benches, Layer::Lines] {
-            write_json(&args.out.with_file_name(format!("{stem}-{layer}.geojson")), &model.feature_collection(layer))?;
-        }
+    for (layer, output) in &outputs.layers {
+        output.write_json(&model.feature_collection(*layer))?;
     }
-    if let Some(path) = &args.model_out {
-        write_json(path, &serde_json::to_value(model)?)?;
+    if let Some(output) = &outputs.model {
+        output.write_json(model)?;
     }
     if let Some(folder) = &args.overlay {
         overlay::draw(&mapping, folder)?;
@@ -164,41 +164,71 @@ pub fn run(args: &MapArgs) -> anyhow::Result<()> {
                 "stage": t.stage.as_str(), "seconds": t.wall.as_secs_f64(), "peak_memory_bytes": t.peak_memory_bytes,
             })).collect::<Vec<_>>(),
         });
-        println!("{summary:#}");
+        print(format_args!("{summary:#}\n"))?;
     } else {
+        let mut summary = String::new();
         for warning in &model.warnings {
-            println!("warning ({}): {}", warning.code, warning.message);
+            writeln!(summary, "warning ({}): {}", warning.code, warning.message)?;
         }
-        println!(
+        writeln!(
+            summary,
             "{} modules in {} sectors, {} benches and {} lines: {}",
             model.modules.len(),
             model.sectors.len(),
             model.benches.len(),
             model.lines.len(),
             args.out.display()
-        );
+        )?;
+        match outputs.take_stdout() {
+            true => tell(summary.trim_end()),
+            false => print(summary)?,
+        }
     }
     if args.timings {
-        eprintln!("{:<10} {:>9} {:>14}", "stage", "seconds", "peak memory");
+        tell(format_args!("{:<10} {:>9} {:>14}", "stage", "seconds", "peak memory"));
         for timing in &mapping.timings {
             let memory = timing.peak_memory_bytes.map_or_else(|| "?".to_owned(), |b| format!("{} MB", b / 1_000_000));
-            eprintln!("{:<10} {:>9.3} {:>14}", timing.stage.as_str(), timing.wall.as_secs_f64(), memory);
+            tell(format_args!("{:<10} {:>9.3} {:>14}", timing.stage.as_str(), timing.wall.as_secs_f64(), memory));
         }
     }
     Ok(())
 }
 
-/// Writes a file whole or not at all.
-pub fn write_json(path: &Path, value: &Value) -> anyhow::Result<()> {
-    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let what = || format!("writing {}", path.display());
-    std::fs::create_dir_all(folder).with_context(what)?;
-    let mut file = tempfile::NamedTempFile::new_in(folder).with_context(what)?;
-    serde_json::to_writer(std::io::BufWriter::new(&mut file), value).with_context(what)?;
-    let readable = std::os::unix::fs::PermissionsExt::from_mode(0o644);
-    file.as_file().set_permissions(readable).with_context(what)?;
-    file.persist(path).with_context(what)?;
-    Ok(())
+/// What the command writes, looked at before it works.
+struct Outputs {
+    layers: Vec<(Layer, Output)>,
+    model: Option<Output>,
+}
+
+impl Outputs {
+    fn named(args: &MapArgs) -> anyhow::Result<Self> {
+        let modules = Output::named(&args.out)?;
+        let mut layers = vec![(Layer::Modules, modules.clone())];
+        if args.layers {
+            ensure!(modules != Output::Stdout, "--layers writes files beside --out: name a file there");
+            let stem = args.out.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+            for layer in [Layer::Sectors, Layer::Benches, Layer::Lines] {
+                layers.push((layer, Output::named(&args.out.with_file_name(format!("{stem}-{layer}.geojson")))?));
+            }
+        }
+        let model = args.model_out.as_deref().map(Output::named).transpose()?;
+        if let Some(model) = &model {
+            let twice = layers.iter().any(|(_, output)| output == model);
+            ensure!(!twice, "--out and --model-out both name {model}: name two files");
+        }
+        if let Some(folder) = &args.overlay {
+            prepare_folder(folder)?;
+        }
+        let outputs = Self { layers, model };
+        ensure!(!(args.json && outputs.take_stdout()), "--json prints to standard output: write the plant to a file");
+        Ok(outputs)
+    }
+
+    /// Whether a document goes to standard output, so that nothing else may.
+    fn take_stdout(&self) -> bool {
+        let layers = self.layers.iter().map(|(_, output)| output);
+        layers.chain(&self.model).any(|output| *output == Output::Stdout)
+    }
 }
 
 fn two_lengths(given: Option<&[f64]>, expected: &'static str) -> anyhow::Result<Option<[f64; 2]>> {
@@ -264,7 +294,7 @@ impl Observer for Report {
             && *last != Some((stage, tenth))
         {
             *last = Some((stage, tenth));
-            eprintln!("{}: {done} of {total}", stage.as_str());
+            tell(format_args!("{}: {done} of {total}", stage.as_str()));
         }
     }
 }

@@ -10,14 +10,16 @@ pub mod keys;
 pub mod map;
 pub mod openapi;
 pub mod organisations;
+pub mod output;
 pub mod serve;
 pub mod worker;
 
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use heliomap::config::{DetectorArgs, JobArgs, Limits, MetricsArgs, RetentionArgs, StorageArgs, WebhookArgs};
 use heliomap::http;
 use heliomap::jobs::{PipelineMapper, Worker, WorkerSettings};
 use heliomap::store::freeing::free_unused;
+use heliomap::store::schema::Schema;
 use heliomap::store::{Blobs, PostgresStore, SqliteStore, Store, StoreError};
 use heliomap::telemetry::metrics::{self, Metrics, Scrape};
 use heliomap::webhooks::{Sender, SenderSettings};
@@ -30,6 +32,9 @@ use tokio::net::TcpListener;
 use tokio::sync::Notify;
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
+
+/// The database of a data folder.
+const ROWS: &str = "heliomap.db";
 
 /// What a crash left among the uploads is deleted after this time.
 const STALE_UPLOADS: Duration = Duration::from_secs(24 * 3600);
@@ -73,7 +78,7 @@ async fn open_storage(args: &StorageArgs) -> anyhow::Result<(Arc<dyn Store>, Blo
     let store: Arc<dyn Store> = match &args.database {
         // The URL may hold a password: it is not said again.
         Some(url) => Arc::new(PostgresStore::open(url).await.context("cannot use the database of --database")?),
-        None => Arc::new(SqliteStore::open(&folder.join("heliomap.db")).await.with_context(hint)?),
+        None => Arc::new(SqliteStore::open(&folder.join(ROWS)).await.with_context(hint)?),
     };
     forget_what_is_over(&*store, &blobs).await.with_context(hint)?;
     Ok((store, blobs))
@@ -92,11 +97,49 @@ async fn forget_what_is_over(store: &dyn Store, blobs: &Blobs) -> Result<(), Sto
     store.forget_deleted_plants(Timestamp::now() - STALE_UPLOADS).await
 }
 
+/// As [`open_storage`], for commands that make nothing new: where no service has been, that is told.
+async fn open_storage_there(args: &StorageArgs) -> anyhow::Result<(Arc<dyn Store>, Blobs)> {
+    let folder = &args.data_dir;
+    match &args.database {
+        Some(url) => {
+            let examined = PostgresStore::examine(url).await.context("cannot use the database of --database")?;
+            ensure!(
+                examined.schema != Schema::Absent,
+                "the database of --database is empty: no service has used it yet"
+            );
+            ensure!(
+                args.blobs.is_some() || folder.is_dir(),
+                "there is no folder {}: name the service's data folder with --data-dir",
+                folder.display()
+            );
+        }
+        None => {
+            let rows = folder.join(ROWS);
+            ensure!(rows.is_file(), "there is no {}: name the service's data folder with --data-dir", rows.display());
+        }
+    }
+    open_storage(args).await
+}
+
+/// The pipeline, its detector opened. Where that fails, whoever named models or a runtime must hear of it; a service without
+/// any still takes uploads, and maps surveys that have boxes of their own.
+async fn pipeline_mapper(args: &DetectorArgs) -> anyhow::Result<Arc<PipelineMapper>> {
+    let detector = args.clone();
+    let mapper = Arc::new(PipelineMapper::new(Box::new(move || Ok(detector.open(0)?.into()))));
+    let opening = mapper.clone();
+    match tokio::task::spawn_blocking(move || opening.open()).await? {
+        Ok(()) => {}
+        Err(error) if args.is_own() => return Err(error).context("cannot use the detector"),
+        Err(error) => tracing::warn!(%error, "there is no detector: jobs that need one fail"),
+    }
+    Ok(mapper)
+}
+
 /// A worker that runs the pipeline.
 fn pipeline_worker(
     store: Arc<dyn Store>,
     blobs: Blobs,
-    detector: DetectorArgs,
+    mapper: Arc<PipelineMapper>,
     jobs: &JobArgs,
     metrics: Metrics,
     bell: Arc<Notify>,
@@ -105,7 +148,7 @@ fn pipeline_worker(
         name: format!("{}-{}", std::process::id(), &uuid::Uuid::new_v4().simple().to_string()[..8]),
         store,
         blobs,
-        mapper: Arc::new(PipelineMapper::new(Box::new(move || Ok(detector.open(0)?.into())))),
+        mapper,
         settings: WorkerSettings::with_lease(jobs.lease),
         metrics,
         bell,
@@ -160,7 +203,7 @@ async fn serve_metrics(args: &MetricsArgs, scrape: Scrape, stop: &CancellationTo
     let listener = TcpListener::bind(address).await;
     let hint = || format!("cannot listen on {address}; choose another address with --metrics-listen");
     let listener = listener.with_context(hint)?;
-    println!("metrics are on http://{}/metrics", listener.local_addr()?);
+    output::print(format_args!("metrics are on http://{}/metrics\n", listener.local_addr()?))?;
     let stop = stop.clone();
     tokio::spawn(async move { http::serve(listener, metrics::router(scrape), &Limits::default(), stop).await });
     Ok(())

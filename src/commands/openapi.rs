@@ -1,5 +1,6 @@
 //! `heliomap openapi`: the description of the HTTP API.
 
+use super::output::print;
 use heliomap::config::OpenapiArgs;
 use heliomap::http;
 
@@ -7,8 +8,7 @@ use heliomap::http;
 pub fn run(args: &OpenapiArgs) -> anyhow::Result<()> {
     let description = http::openapi();
     match args.json {
-        true => println!("{}", description.to_pretty_json()?),
-        false => print!("{}", description.to_yaml()?),
+        true => print(format_args!("{}\n", description.to_pretty_json()?)),
+        false => print(description.to_yaml()?),
     }
-    Ok(())
 }

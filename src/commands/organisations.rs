@@ -1,6 +1,7 @@
 //! `heliomap organisations`: who there is, what each keeps and may keep.
 
-use super::{open_storage, run_async};
+use super::output::print;
+use super::{open_storage, open_storage_there, run_async};
 use anyhow::Context;
 use heliomap::config::{OrganisationsArgs, OrganisationsCommand};
 use heliomap::store::usage::{Quotas, UNLIMITED, Usage};
@@ -10,17 +11,22 @@ use jiff::Timestamp;
 /// Runs the command.
 pub fn run(args: OrganisationsArgs) -> anyhow::Result<()> {
     run_async(async {
-        let (store, _) = open_storage(&args.storage).await?;
+        let (store, _) = match args.command {
+            OrganisationsCommand::Create { .. } => open_storage(&args.storage).await?,
+            OrganisationsCommand::List | OrganisationsCommand::Quota { .. } => {
+                open_storage_there(&args.storage).await?
+            }
+        };
         match args.command {
             OrganisationsCommand::List => {
                 for (organisation, usage) in store.organisations(Timestamp::now()).await? {
-                    println!("{}", line(&organisation, &usage));
+                    print(line(&organisation, &usage))?;
                 }
             }
             OrganisationsCommand::Create { name } => {
                 store.create_organisation(&name, Timestamp::now()).await?;
                 let (organisation, usage) = named(&*store, &name).await?;
-                println!("{}", line(&organisation, &usage));
+                print(line(&organisation, &usage))?;
             }
             OrganisationsCommand::Quota { name, bytes, plants } => {
                 let (organisation, usage) = named(&*store, &name).await?;
@@ -29,7 +35,7 @@ pub fn run(args: OrganisationsArgs) -> anyhow::Result<()> {
                     plants: plants.map_or(usage.own.plants, |quota| quota.0),
                 };
                 store.set_quotas(organisation.id, own).await?;
-                println!("{}", line(&organisation, &Usage { own, ..usage }));
+                print(line(&organisation, &Usage { own, ..usage }))?;
             }
         }
         Ok(())
@@ -50,7 +56,7 @@ fn line(organisation: &Organisation, usage: &Usage) -> String {
         Some(quota) => quota.to_string(),
     };
     format!(
-        "{}  bytes {} (quota {})  plants {} (quota {})  {}",
+        "{}  bytes {} (quota {})  plants {} (quota {})  {}\n",
         organisation.id,
         usage.bytes,
         of(usage.own.bytes),

@@ -1,6 +1,10 @@
 //! `heliomap serve`: the HTTP API and the web page, with a worker inside.
 
-use super::{GRACE, keep_tidy, open_storage, pipeline_worker, run_async, send_messages, serve_metrics, stop_signal};
+use super::output::print;
+use super::{
+    GRACE, keep_tidy, open_storage, pipeline_mapper, pipeline_worker, run_async, send_messages, serve_metrics,
+    stop_signal,
+};
 use anyhow::Context;
 use heliomap::config::ServeArgs;
 use heliomap::http::{self, AppState};
@@ -23,6 +27,10 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
         let oidc = args.oidc.settings().map_err(anyhow::Error::msg)?.map(Oidc::new).transpose();
         let oidc = oidc.context("cannot use the provider of --oidc-issuer")?;
         let oidc = oidc.map(Arc::new);
+        let mapper = match args.no_worker {
+            true => None,
+            false => Some(pipeline_mapper(&args.detector).await?),
+        };
         let (store, blobs) = open_storage(&args.storage).await?;
         let stop = stop_signal()?;
         let listener = TcpListener::bind(args.listen)
@@ -36,6 +44,7 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
             stop: stop.clone(),
             oidc,
             targets: args.webhooks.targets(),
+            mapper: mapper.clone(),
             insecure: args.insecure,
             ..AppState::new(store.clone(), blobs.clone(), args.limits.clone())
         };
@@ -43,9 +52,11 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
         let scrape = Scrape { metrics: metrics.clone(), store: store.clone(), blobs: blobs.clone() };
         let sending = send_messages(&args.webhooks, &store, &metrics, &stop);
         keep_tidy(&args.retention, &store, &blobs, &stop);
-        let worker = pipeline_worker(store.clone(), blobs, args.detector, &args.jobs, metrics, bell);
-        let worker_stop = stop.clone();
-        let working = (!args.no_worker).then(|| tokio::spawn(async move { worker.run(worker_stop).await }));
+        let working = mapper.map(|mapper| {
+            let worker = pipeline_worker(store.clone(), blobs, mapper, &args.jobs, metrics, bell);
+            let stop = stop.clone();
+            tokio::spawn(async move { worker.run(stop).await })
+        });
 
         let (app, limits, closing) = (http::router(state), args.limits, stop.clone());
         let serving = tokio::spawn(async move { http::serve(listener, app, &limits, closing).await });
@@ -55,7 +66,7 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
                  on the same data folder"
             );
         }
-        println!("heliomap is listening on http://{address}");
+        print(format_args!("heliomap is listening on http://{address}\n"))?;
         serve_metrics(&args.metrics, scrape, &stop).await?;
 
         stop.cancelled().await;

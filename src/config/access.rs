@@ -4,7 +4,7 @@ use super::StorageArgs;
 use super::limits::parse_size;
 use crate::plant::PlantId;
 use crate::store::usage::UNLIMITED;
-use crate::store::{KeyId, Scope};
+use crate::store::{KeyId, Scope, name};
 use clap::{Args, Subcommand};
 
 /// `heliomap keys`.
@@ -22,19 +22,19 @@ pub enum KeysCommand {
     /// Make a key and print its secret, which is kept nowhere.
     Create {
         /// What people call it.
-        #[arg(long, value_name = "NAME")]
+        #[arg(long, value_parser = parse_name, value_name = "NAME")]
         name: String,
         /// What it is good for; may be given more than once.
         #[arg(long, value_enum, value_name = "SCOPE", required = true)]
         scope: Vec<Scope>,
         /// The organisation that it belongs to, by name; made where there is none.
-        #[arg(long, value_name = "NAME", default_value = "default")]
+        #[arg(long, value_parser = parse_name, value_name = "NAME", default_value = "default")]
         organisation: String,
         /// A plant that it is good for; may be given more than once; all plants where it is not given.
         #[arg(long, value_name = "UUID")]
         plant: Vec<PlantId>,
-        /// Days after which it ends; never where it is not given.
-        #[arg(long, value_name = "N")]
+        /// Days after which it ends, 1 to 36500; never where it is not given.
+        #[arg(long, value_parser = clap::value_parser!(u32).range(1..=36_500), value_name = "N")]
         days: Option<u32>,
     },
     /// List all keys.
@@ -50,10 +50,14 @@ pub enum KeysCommand {
         /// The key's identifier.
         #[arg(value_parser = parse_key_id, value_name = "UUID")]
         id: KeyId,
-        /// Hours for which the secret so far stays good.
-        #[arg(long, value_name = "N", default_value_t = 0)]
+        /// Hours for which the secret so far stays good, up to 720 (30 days).
+        #[arg(long, value_parser = clap::value_parser!(u32).range(..=720), value_name = "N", default_value_t = 0)]
         grace_hours: u32,
     },
+}
+
+fn parse_name(text: &str) -> Result<String, name::InvalidName> {
+    name::checked(text).map(str::to_owned)
 }
 
 fn parse_key_id(text: &str) -> Result<KeyId, uuid::Error> {
@@ -77,7 +81,7 @@ pub enum OrganisationsCommand {
     /// Make an organisation, or find the one of that name.
     Create {
         /// The organisation's name.
-        #[arg(value_name = "NAME")]
+        #[arg(value_parser = parse_name, value_name = "NAME")]
         name: String,
     },
     /// Say what an organisation may keep; what is not given stays as it is.

@@ -2,6 +2,7 @@
 
 use super::{Detection, ImageDetections, Source};
 use crate::geometry::Quad;
+use nalgebra::Vector2;
 use serde::{Deserialize, Serialize};
 use std::collections::HashSet;
 use std::fs::File;
@@ -73,11 +74,20 @@ pub enum BoxError {
     NoQuad { name: String, image: String, index: usize },
 }
 
-/// Reads a file of boxes.
+/// What a file of boxes holds.
+#[derive(Debug, Clone, PartialEq)]
+pub struct BoxesRead {
+    pub images: Vec<ImageDetections>,
+    /// Names of images of which some boxes cannot be used, and how many.
+    pub left_out: Vec<(String, usize)>,
+}
+
+/// Reads a file of boxes. Those that lie outside of their image and those without area are left out, unless there are no
+/// others: then the file as a whole is not what it should be.
 ///
 /// # Errors
-/// A file that is not of this form, or a box without area.
-pub fn read(path: &Path) -> Result<Vec<ImageDetections>, BoxError> {
+/// A file that is not of this form, or holds boxes none of which can be used.
+pub fn read(path: &Path) -> Result<BoxesRead, BoxError> {
     let name = path.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned());
     let unreadable = |source| BoxError::Unreadable { name: name.clone(), source };
     let file = File::open(path).map_err(unreadable)?;
@@ -88,41 +98,56 @@ pub fn read(path: &Path) -> Result<Vec<ImageDetections>, BoxError> {
     let boxes: BoxFile = serde_json::from_reader(BufReader::new(file.take(MAX_BYTES)))
         .map_err(|error| BoxError::Malformed { name: name.clone(), what: error.to_string() })?;
     let mut names = HashSet::new();
-    boxes
-        .images
-        .into_iter()
-        .map(|image| {
-            if !names.insert(image.image.clone()) {
-                return Err(BoxError::Repeated { name: name.clone(), image: image.image });
+    let (mut images, mut left_out) = (Vec::with_capacity(boxes.images.len()), Vec::new());
+    let mut first_fault = None;
+    for image in boxes.images {
+        if !names.insert(image.image.clone()) {
+            return Err(BoxError::Repeated { name, image: image.image });
+        }
+        if image.boxes.len() > MAX_BOXES {
+            return Err(BoxError::TooMany { name, count: image.boxes.len(), image: image.image });
+        }
+        if image.width == 0 || image.height == 0 {
+            return Err(BoxError::Malformed { name, what: format!("{} has no size", image.image) });
+        }
+        let mut detections = Vec::with_capacity(image.boxes.len());
+        for (index, given) in image.boxes.iter().enumerate() {
+            match detection(given, &image, &name, index) {
+                Ok(detection) => detections.push(detection),
+                Err(fault) => first_fault = first_fault.or(Some(fault)),
             }
-            if image.boxes.len() > MAX_BOXES {
-                return Err(BoxError::TooMany { name: name.clone(), count: image.boxes.len(), image: image.image });
-            }
-            let (width, height) = (image.width, image.height);
-            if image.width == 0 || image.height == 0 {
-                return Err(BoxError::Malformed { name: name.clone(), what: format!("{} has no size", image.image) });
-            }
-            let detections = image
-                .boxes
-                .iter()
-                .enumerate()
-                .map(|(index, b)| {
-                    let no_quad = || BoxError::NoQuad { name: name.clone(), image: image.image.clone(), index };
-                    let quad =
-                        Quad::from_unordered(b.corners.map(Into::into)).filter(Quad::is_convex).ok_or_else(no_quad)?;
-                    // A module that the frame cuts may reach out of it, but not lie outside.
-                    let center = quad.center();
-                    if !(0.0..f64::from(width)).contains(&center.x) || !(0.0..f64::from(height)).contains(&center.y) {
-                        let (name, image) = (name.clone(), image.image.clone());
-                        return Err(BoxError::Outside { name, image, index, width, height });
-                    }
-                    let score = if b.score.is_finite() { b.score.clamp(0.0, 1.0) } else { return Err(no_quad()) };
-                    Ok(Detection { quad, score, source: b.source })
-                })
-                .collect::<Result<Vec<_>, BoxError>>()?;
-            Ok(ImageDetections { image: image.image, width_px: image.width, height_px: image.height, detections })
-        })
-        .collect()
+        }
+        let unusable = image.boxes.len() - detections.len();
+        if unusable > 0 {
+            left_out.push((image.image.clone(), unusable));
+        }
+        images.push(ImageDetections { image: image.image, width_px: image.width, height_px: image.height, detections });
+    }
+    match first_fault {
+        Some(fault) if images.iter().all(|image| image.detections.is_empty()) => Err(fault),
+        _ => Ok(BoxesRead { images, left_out }),
+    }
+}
+
+/// The module that a box tells of.
+fn detection(given: &OrientedBox, image: &BoxImage, name: &str, index: usize) -> Result<Detection, BoxError> {
+    let no_quad = || BoxError::NoQuad { name: name.to_owned(), image: image.image.clone(), index };
+    let (width, height) = (f64::from(image.width), f64::from(image.height));
+    let quad = Quad::from_unordered(given.corners.map(Into::into)).ok_or_else(no_quad)?;
+    // A module that the frame cuts may reach out of it, but not lie outside.
+    let center = quad.center();
+    let is_inside = (0.0..width).contains(&center.x) && (0.0..height).contains(&center.y);
+    let is_near = |corner: &Vector2<f64>| {
+        (-width..2.0 * width).contains(&corner.x) && (-height..2.0 * height).contains(&corner.y)
+    };
+    if !is_inside || !quad.corners.iter().all(is_near) {
+        let (name, image, width, height) = (name.to_owned(), image.image.clone(), image.width, image.height);
+        return Err(BoxError::Outside { name, image, index, width, height });
+    }
+    if !quad.is_convex() || !given.score.is_finite() {
+        return Err(no_quad());
+    }
+    Ok(Detection { quad, score: given.score.clamp(0.0, 1.0), source: given.source })
 }
 
 /// The form in which boxes are written.
@@ -149,10 +174,16 @@ mod tests {
     use super::*;
     use serde_json::{Value, json};
 
-    fn read_text(text: &str) -> Result<Vec<ImageDetections>, BoxError> {
+    fn read_file(text: &str) -> Result<BoxesRead, BoxError> {
         let file = tempfile::NamedTempFile::new().unwrap();
         std::fs::write(file.path(), text).unwrap();
         read(file.path())
+    }
+
+    fn read_text(text: &str) -> Result<Vec<ImageDetections>, BoxError> {
+        let read = read_file(text)?;
+        assert!(read.left_out.is_empty(), "{:?}", read.left_out);
+        Ok(read.images)
     }
 
     fn file_of(corners: &Value) -> String {
@@ -175,6 +206,21 @@ mod tests {
         let found = read_text(&file_of(&json!([[10.0, 10.0], [30.0, 12.0], [29.0, 24.0], [9.0, 22.0]]))).unwrap();
         let text = serde_json::to_string(&to_file(&found)).unwrap();
         assert_eq!(read_text(&text).unwrap(), found);
+    }
+
+    #[test]
+    fn single_boxes_that_cannot_be_used_are_left_out() {
+        let good = json!({"corners": [[10, 10], [30, 10], [30, 20], [10, 20]]});
+        let outside = json!({"corners": [[-10.1, 10], [9.9, 10], [9.9, 20], [-10.1, 20]]});
+        let thin = json!({"corners": [[10, 10], [30, 10], [30, 10], [10, 10]]});
+        let endless = json!({"corners": [[-1e300, -1e300], [1e300, -1e300], [1e300, 1e300], [-1e300, 1e300]]});
+        let images = json!({"images": [
+            {"image": "a.jpg", "width": 100, "height": 80, "boxes": [outside, good, thin, endless]},
+            {"image": "b.jpg", "width": 100, "height": 80, "boxes": [good]},
+        ]});
+        let read = read_file(&images.to_string()).unwrap();
+        assert_eq!(read.left_out, [("a.jpg".to_owned(), 3)]);
+        assert_eq!(read.images.iter().map(|image| image.detections.len()).collect::<Vec<_>>(), [1, 1]);
     }
 
     #[test]

@@ -101,6 +101,12 @@ pub enum DetectionError {
     ModelChoice(String),
     #[error("the model {name} cannot be read: {source}")]
     ModelUnreadable { name: String, source: std::io::Error },
+    #[error(
+        "the model {name}, which comes with heliomap, is not there: it is looked for in models/ of the working directory, and \
+         in models/ and share/heliomap/models/ of the program's folder and those above it; put it there, or name an ONNX file \
+         with --detector"
+    )]
+    ShippedModelMissing { name: String },
     #[error("the model {name} is larger than the {limit} bytes that are read")]
     ModelTooLarge { name: String, limit: u64 },
     #[error("{name} is no ONNX model: {what}")]
@@ -124,6 +130,7 @@ impl DetectionError {
             Self::ProviderMissing { .. } => "execution_provider_missing",
             Self::ModelChoice(_) => "model_choice",
             Self::ModelUnreadable { .. } => "model_unreadable",
+            Self::ShippedModelMissing { .. } => "model_unreadable",
             Self::ModelTooLarge { .. } => "model_too_large",
             Self::NotAModel { .. } => "model_invalid",
             Self::UnfitModel { .. } => "model_unfit",

@@ -17,7 +17,8 @@ const SHIPPED: [(&str, &[&str]); 3] =
 pub fn open(named: &[String], settings: RuntimeSettings) -> Result<Box<dyn Detector>, DetectionError> {
     let choice = |what: &str| DetectionError::ModelChoice(format!("{what}: name a U-Net, a YOLO, or one of each"));
     let (mut unet, mut yolo) = (None, None);
-    for path in named.iter().flat_map(|name| files_of(name)) {
+    let paths = named.iter().map(|name| files_of(name)).collect::<Result<Vec<_>, _>>()?;
+    for path in paths.into_iter().flatten() {
         let model = runtime::open_model(&path, settings)?;
         match is_yolo(&model) {
             true if yolo.is_some() => return Err(choice("two of the models are YOLOs")),
@@ -43,19 +44,32 @@ fn is_yolo(model: &ImageModel) -> bool {
 }
 
 /// The files of a shipped model, or the path that it is.
-fn files_of(name: &str) -> Vec<PathBuf> {
+fn files_of(name: &str) -> Result<Vec<PathBuf>, DetectionError> {
     match SHIPPED.iter().find(|(shipped, _)| *shipped == name) {
         Some((_, files)) => files.iter().map(|file| shipped(file)).collect(),
-        None => vec![PathBuf::from(name)],
+        None => Ok(vec![PathBuf::from(name)]),
     }
 }
 
 /// Where a shipped model lies: in `models/` of the working directory, else beside the executable or in one of its parents,
 /// or in their `share/heliomap/`.
-fn shipped(file: &str) -> PathBuf {
+fn shipped(file: &str) -> Result<PathBuf, DetectionError> {
     let here = Path::new("models").join(file);
     let executable = std::env::current_exe().ok();
     let above = executable.iter().flat_map(|path| path.ancestors().skip(1));
     let beside = above.flat_map(|folder| [folder.join(&here), folder.join("share/heliomap").join(&here)]);
-    std::iter::once(here.clone()).chain(beside).find(|path| path.is_file()).unwrap_or(here)
+    let found = std::iter::once(here.clone()).chain(beside).find(|path| path.is_file());
+    found.ok_or_else(|| DetectionError::ShippedModelMissing { name: file.to_owned() })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_shipped_model_that_is_missing_is_told_with_where_it_is_looked_for() {
+        assert!(shipped("unet.onnx").is_ok_and(|path| path.is_file()));
+        let error = shipped("none.onnx").unwrap_err().to_string();
+        assert!(error.contains("none.onnx") && error.contains("share/heliomap/models/"), "{error}");
+    }
 }

@@ -279,7 +279,7 @@ impl ImageModel {
 /// model or one with other inputs.
 pub(super) fn open_model(path: &Path, settings: RuntimeSettings) -> Result<ImageModel, DetectionError> {
     let name = path.file_name().map_or_else(|| path.display().to_string(), |name| name.to_string_lossy().into_owned());
-    let bytes = read_bounded(path, &name)?;
+    let bytes = read_bounded(path)?;
     let no_model = |what: String| DetectionError::NotAModel { name: name.clone(), what };
     if bytes.is_empty() {
         return Err(no_model("the file is empty".to_owned()));
@@ -367,17 +367,18 @@ fn hexadecimal(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-fn read_bounded(path: &Path, name: &str) -> Result<Vec<u8>, DetectionError> {
-    let unreadable = |source| DetectionError::ModelUnreadable { name: name.to_owned(), source };
+fn read_bounded(path: &Path) -> Result<Vec<u8>, DetectionError> {
+    let name = || path.display().to_string();
+    let unreadable = |source| DetectionError::ModelUnreadable { name: name(), source };
     let file = File::open(path).map_err(unreadable)?;
     let size = file.metadata().map_err(unreadable)?;
     if size.is_dir() {
-        return Err(DetectionError::NotAModel { name: name.to_owned(), what: "it is a folder".to_owned() });
+        return Err(DetectionError::NotAModel { name: name(), what: "it is a folder".to_owned() });
     }
     let mut bytes = Vec::new();
     file.take(MAX_MODEL_BYTES + 1).read_to_end(&mut bytes).map_err(unreadable)?;
     if bytes.len() as u64 > MAX_MODEL_BYTES {
-        return Err(DetectionError::ModelTooLarge { name: name.to_owned(), limit: MAX_MODEL_BYTES });
+        return Err(DetectionError::ModelTooLarge { name: name(), limit: MAX_MODEL_BYTES });
     }
     Ok(bytes)
 }

@@ -127,6 +127,17 @@ impl ApiError {
         )
     }
 
+    /// A problem of which the document was kept.
+    pub fn told_before(document: &Value) -> Self {
+        let code = Code::ALL.iter().copied().find(|code| document["code"] == code.parts().1);
+        let detail = document["detail"].as_str().unwrap_or("the same was refused before").to_owned();
+        let mut problem = Self::new(code.unwrap_or(Code::BadRequest), detail);
+        let own = ["type", "title", "status", "code", "detail"];
+        let members = document.as_object().into_iter().flatten().filter(|(name, _)| !own.contains(&name.as_str()));
+        problem.members.extend(members.map(|(name, value)| (name.clone(), value.clone())));
+        problem
+    }
+
     /// The problem document.
     pub fn document(&self) -> Value {
         let (status, code, title) = self.code.parts();

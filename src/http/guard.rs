@@ -313,9 +313,17 @@ impl Gate {
         if caller.scopes.contains(&Scope::Admin) || !caller.scopes.is_disjoint(need) {
             return Ok(());
         }
-        let words: Vec<&str> = need.iter().map(|scope| scope.as_str()).chain(["admin"]).collect();
-        let detail = format!("this takes a key with one of the scopes {}", words.join(", "));
-        Err(ApiError::new(Code::Forbidden, detail))
+        Err(ApiError::new(Code::Forbidden, lacking(need)))
+    }
+}
+
+/// What is said to a key that has none of these scopes.
+fn lacking(need: &BTreeSet<Scope>) -> String {
+    let others = need.iter().filter(|scope| **scope != Scope::Admin).map(|scope| scope.as_str());
+    let words: Vec<&str> = others.chain([Scope::Admin.as_str()]).collect();
+    match words.as_slice() {
+        [only] => format!("this takes a key with the scope {only}"),
+        words => format!("this takes a key with one of the scopes {}", words.join(", ")),
     }
 }
 
@@ -352,6 +360,13 @@ pub fn request_id(request: &Request) -> &str {
 mod tests {
     use super::*;
     use crate::http::openapi;
+
+    #[test]
+    fn scopes_are_named_once() {
+        assert_eq!(lacking(&BTreeSet::from([Scope::Admin])), "this takes a key with the scope admin");
+        let several = lacking(&BTreeSet::from([Scope::Read, Scope::Admin]));
+        assert_eq!(several, "this takes a key with one of the scopes read, admin");
+    }
 
     #[test]
     fn only_what_says_nothing_of_anyone_is_open() {

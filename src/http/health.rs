@@ -13,9 +13,16 @@ pub struct Health {
     pub status: &'static str,
     /// The version of the program.
     pub version: &'static str,
+    /// What whoever runs the service should see to; left out where there is nothing.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub warnings: Vec<&'static str>,
 }
 
-const FINE: Health = Health { status: "ok", version: env!("CARGO_PKG_VERSION") };
+const FINE: Health = Health { status: "ok", version: env!("CARGO_PKG_VERSION"), warnings: Vec::new() };
+
+/// What is said where the worker of this process has no detector.
+const NO_DETECTOR: &str = "the detector cannot be opened, so that only surveys with boxes of their own can be mapped here: \
+    `heliomap doctor` tells why";
 
 /// Whether the process runs
 #[utoipa::path(get, path = "/health", tag = "operation", security(()), responses((status = 200, body = Health)))]
@@ -23,7 +30,7 @@ pub async fn health() -> Json<Health> {
     Json(FINE)
 }
 
-/// Whether database and blob store answer
+/// Whether database and blob store answer, and whether the process's worker has what it needs
 #[utoipa::path(
     get,
     path = "/ready",
@@ -41,5 +48,7 @@ pub async fn ready(State(state): State<AppState>) -> Result<Json<Health>, ApiErr
             return Err(ApiError::new(Code::Unavailable, "the service's storage does not answer").retry_after(5));
         }
     }
-    Ok(Json(FINE))
+    let lacks_detector = state.mapper.as_ref().is_some_and(|mapper| !mapper.has_detector());
+    let warnings = lacks_detector.then_some(NO_DETECTOR).into_iter().collect();
+    Ok(Json(Health { warnings, ..FINE }))
 }

@@ -7,7 +7,7 @@ use super::extract::{ApiJson, ApiPath, ApiQuery};
 use super::guard::Caller;
 use super::paging::{List, filtered_list, prefix_filter};
 use crate::plant::PlantId;
-use crate::store::{Created, Plant};
+use crate::store::{Created, Plant, name};
 use axum::Json;
 use axum::extract::State;
 use axum::http::{HeaderMap, StatusCode, header};
@@ -40,14 +40,9 @@ impl From<Plant> for PlantView {
     }
 }
 
-/// Reads a name that people give: one line, not empty, not endless.
+/// Reads a name that people give.
 pub fn checked_name(name: &str) -> Result<&str, ApiError> {
-    let name = name.trim();
-    let length = name.chars().count();
-    if (1..=200).contains(&length) && !name.chars().any(char::is_control) {
-        return Ok(name);
-    }
-    Err(ApiError::new(Code::InvalidName, "a name has 1 to 200 characters and no line breaks"))
+    name::checked(name).map_err(|error| ApiError::new(Code::InvalidName, error.to_string()))
 }
 
 filtered_list!(

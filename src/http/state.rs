@@ -4,6 +4,7 @@ use super::error::{ApiError, Code};
 use super::rates::Rates;
 use super::tus::Desk;
 use crate::config::{Limits, NetworkArgs};
+use crate::jobs::PipelineMapper;
 use crate::oidc::Oidc;
 use crate::plant::PlantId;
 use crate::store::{Blobs, Plant, Store, Survey, SurveyId};
@@ -33,6 +34,8 @@ pub struct AppState {
     pub oidc: Option<Arc<Oidc>>,
     /// Where webhooks may lead.
     pub targets: Targets,
+    /// What the worker of this process maps with, where it has one.
+    pub mapper: Option<Arc<PipelineMapper>>,
     /// Whether anyone may do anything, without a key.
     pub insecure: bool,
 }
@@ -59,6 +62,7 @@ impl AppState {
             stop: CancellationToken::new(),
             oidc: None,
             targets: Targets::Public,
+            mapper: None,
             insecure: false,
         }
     }

@@ -5,7 +5,7 @@ use crate::pipeline::{self, Boxes, Found, Loaded, MapError, MapOptions, Observer
 use crate::plant::PlantModel;
 use crate::store::{Digest, TaskClaim};
 use std::path::Path;
-use std::sync::{Arc, Mutex, OnceLock};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError, TryLockError};
 
 /// Maps the plant in a folder. Called on a thread of its own.
 pub trait Mapper: Send + Sync + 'static {
@@ -38,7 +38,7 @@ const BOXES_FILE: &str = "boxes.json";
 /// Opens a detector.
 pub type OpenDetector = dyn Fn() -> Result<Arc<dyn Detector>, DetectionError> + Send + Sync;
 
-/// The pipeline with its detector, which is opened at the first job and kept.
+/// The pipeline with its detector, which is opened once and kept; where it cannot be opened, every job tries again.
 pub struct PipelineMapper {
     open: Box<OpenDetector>,
     detector: Mutex<Option<Arc<dyn Detector>>>,
@@ -50,12 +50,33 @@ impl PipelineMapper {
         Self { open, detector: Mutex::new(None) }
     }
 
+    /// Opens the detector, so that what is wrong with it is known before a job needs it.
+    ///
+    /// # Errors
+    /// What is wrong with it.
+    pub fn open(&self) -> Result<(), DetectionError> {
+        self.opened().map(drop)
+    }
+
+    /// Whether the detector is open, or just being opened.
+    pub fn has_detector(&self) -> bool {
+        match self.detector.try_lock() {
+            Ok(kept) => kept.is_some(),
+            Err(TryLockError::WouldBlock) => true,
+            Err(TryLockError::Poisoned(kept)) => kept.into_inner().is_some(),
+        }
+    }
+
     fn detector(&self) -> Result<Arc<dyn Detector>, MapError> {
-        let mut kept = self.detector.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        self.opened().map_err(|error| MapError::Environment { message: error.to_string() })
+    }
+
+    fn opened(&self) -> Result<Arc<dyn Detector>, DetectionError> {
+        let mut kept = self.detector.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(detector) = &*kept {
             return Ok(detector.clone());
         }
-        let detector = (self.open)().map_err(|error| MapError::Environment { message: error.to_string() })?;
+        let detector = (self.open)()?;
         tracing::info!(detector = detector.describe(), "detector opened");
         *kept = Some(detector.clone());
         Ok(detector)

@@ -188,15 +188,17 @@ fn recalled(project: &Project, chosen: &[usize], observer: &dyn Observer) -> (Ve
 pub(super) fn from_boxes(
     project: &Project,
     path: &Path,
+    gsd_m: &[Option<f64>],
+    options: &MapOptions,
     clock: &mut Clock<'_>,
     warnings: &mut Vec<Warning>,
 ) -> Result<Vec<Seen>, MapError> {
-    let given = clock.stage(Stage::Detect, || external::read(path))??;
+    let read = clock.stage(Stage::Detect, || external::read(path))??;
     let by_name: HashMap<&str, usize> =
         project.reconstruction.shots.iter().enumerate().map(|(index, shot)| (shot.name.as_str(), index)).collect();
     let mut seen: Vec<(usize, ImageDetections)> = Vec::new();
     let mut unknown = Vec::new();
-    for detections in given {
+    for detections in read.images {
         let Some(&shot) = by_name.get(detections.image.as_str()) else {
             unknown.push(detections.image);
             continue;
@@ -213,6 +215,51 @@ pub(super) fn from_boxes(
             });
         }
         seen.push((shot, detections));
+    }
+    if seen.is_empty() {
+        let shot = project.reconstruction.shots.first().map_or("", |shot| shot.name.as_str());
+        let named = unknown.first().map_or_else(
+            || "it names no image".to_owned(),
+            |image| format!("none of its {} images is in the reconstruction, such as `{image}`", unknown.len()),
+        );
+        return Err(MapError::Input {
+            code: "boxes_invalid",
+            message: format!(
+                "{}: {named}; name images as the reconstruction names its shots, such as `{shot}`",
+                path.display()
+            ),
+        });
+    }
+    let left_out = read.left_out.into_iter().filter(|(image, _)| by_name.contains_key(image.as_str()));
+    let (images, counts): (Vec<String>, Vec<usize>) = left_out.unzip();
+    if !images.is_empty() {
+        warnings.push(Warning::new(
+            "boxes_unusable",
+            format!(
+                "{} boxes in {} images lie outside of their image or have no area, and are left out",
+                counts.iter().sum::<usize>(),
+                images.len()
+            ),
+            images,
+        ));
+    }
+    // What those notes say of a search does not hold here.
+    let expected = resolving(project, gsd_m, options, &mut Vec::new());
+    let is_given = |shot: &usize| seen.iter().any(|(given, _)| given == shot);
+    let without: Vec<String> = expected
+        .into_iter()
+        .filter(|shot| !is_given(shot))
+        .map(|shot| project.reconstruction.shots[shot].name.clone())
+        .collect();
+    if !without.is_empty() {
+        warnings.push(Warning::new(
+            "images_without_boxes",
+            format!(
+                "{} images that resolve modules are not in the file of boxes, and count for nothing",
+                without.len()
+            ),
+            without,
+        ));
     }
     if !unknown.is_empty() {
         warnings.push(Warning::new(

@@ -7,6 +7,7 @@ pub mod access;
 pub mod blobs;
 pub mod bucket;
 pub mod freeing;
+pub mod name;
 pub mod postgres;
 pub mod records;
 pub mod requests;

@@ -1,6 +1,7 @@
 //! Where a file stands in a survey's folder, which is laid out as OpenSfM leaves it. Parsed where it enters: a value of
 //! these types is safe to join to a folder.
 
+use super::name::steers;
 use std::fmt;
 
 /// Names longer than this do not fit every file system.
@@ -79,8 +80,8 @@ impl ImageName {
         if name.len() > MAX_NAME_BYTES {
             return refuse("it is longer than 200 bytes");
         }
-        if name.chars().any(|c| c.is_control() || matches!(c, '/' | '\\' | ':' | '*' | '?' | '"' | '<' | '>' | '|')) {
-            return refuse("it holds a control character or one of / \\ : * ? \" < > |");
+        if name.chars().any(|c| steers(c) || matches!(c, '/' | '\\' | ':' | '*' | '?' | '"' | '<' | '>' | '|')) {
+            return refuse("it holds a character that steers how text is shown, or one of / \\ : * ? \" < > |");
         }
         if name.starts_with('.') || name.starts_with(' ') {
             return refuse("it begins with a dot or a space");

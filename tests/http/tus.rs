@@ -89,6 +89,33 @@ async fn what_came_before_the_line_broke_counts() {
     assert_eq!(app.get(&survey).await.1["files"][0]["sha256"], Digest::of(&photo).to_string());
 }
 
+#[tokio::test]
+async fn a_whole_upload_may_be_ended_again() {
+    let app = App::new(&[]).await;
+    let survey = app.survey().await;
+    let photo = jpeg(64, 48);
+    let upload = begin(&app, &survey, photo.len(), &metadata("filename", "a.jpg")).await;
+    assert_eq!(more(&app, &upload, 0, &photo).send().await.unwrap().status(), StatusCode::NO_CONTENT);
+    let end = photo.len();
+    let again = more(&app, &upload, end, b"").send().await.unwrap();
+    let told = again.headers()["upload-offset"].to_str().unwrap().to_owned();
+    assert_eq!((again.status(), told), (StatusCode::NO_CONTENT, end.to_string()));
+    // The request whose answer was lost, and one whose length is not told.
+    let repeated = more(&app, &upload, 0, &photo).send().await.unwrap();
+    assert_problem(problem(repeated).await, 409, "upload_offset", "ask with HEAD");
+    assert_problem(
+        problem(more(&app, &upload, end, b"x").send().await.unwrap()).await,
+        400,
+        "bad_request",
+        "more than",
+    );
+    let unmeasured = tus(&app, Method::PATCH, &upload).header("upload-offset", end);
+    let unmeasured = unmeasured.header("content-type", "application/offset+octet-stream");
+    let surplus = reqwest::Body::wrap_stream(futures::stream::iter([Ok::<_, std::io::Error>("x")]));
+    assert_problem(problem(unmeasured.body(surplus).send().await.unwrap()).await, 400, "bad_request", "more than");
+    assert_eq!(app.get(&survey).await.1["files"][0]["sha256"], Digest::of(&photo).to_string());
+}
+
 /// A request that brings `first`, and `rest` once it is told to; nothing more where it never is.
 fn brings_more_later(
     app: &App,
@@ -253,6 +280,8 @@ async fn a_file_that_is_refused_says_why() {
     let refused = more(&app, &upload, 0, b"no jpeg").send().await.unwrap();
     assert_problem(problem(refused).await, 422, "image_unreadable", "images/a.jpg");
     assert_eq!(app.get(&upload).await.1["outcome"]["problem"]["code"], "image_unreadable");
+    let again = more(&app, &upload, 7, b"").send().await.unwrap();
+    assert_problem(problem(again).await, 422, "image_unreadable", "images/a.jpg");
     assert_eq!(app.get(&survey).await.1["files"], json!([]));
     let ended = json_of(tus(&app, Method::DELETE, &upload).send().await.unwrap()).await;
     assert_eq!(ended.0, StatusCode::NO_CONTENT);

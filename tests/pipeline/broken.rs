@@ -183,6 +183,8 @@ fn broken_boxes() {
     survey.is_refused(&[], &["boxes.json is not a file of boxes"]);
     survey.change_boxes(image(json!([{"corners": [[1, 1], [1, 1], [1, 1], [1, 1]]}])));
     survey.is_refused(&[], &["boxes.json: box 0 of DJI_0001.jpg"]);
+    survey.change_boxes(json!({"images": [{"image": "photos/DJI_0001", "width": 1368, "height": 912, "boxes": []}]}));
+    survey.is_refused(&[], &["none of its 1 images", "`photos/DJI_0001`", "such as `DJI_0001.jpg`"]);
     survey.change_boxes(json!({"images": [{"image": "DJI_0001.jpg", "width": 2736, "height": 1824, "boxes": []}]}));
     survey.is_refused(&[], &["DJI_0001.jpg", "2736 x 1824", "1368 x 912"]);
 }

@@ -1,6 +1,6 @@
 //! Surveys that are not as they should be and are mapped all the same, with a word about it.
 
-use crate::boxes::EXAMPLE;
+use crate::boxes::{EXAMPLE, true_boxes};
 use crate::survey::{CLOUD, Survey, can_detect, heliomap};
 use image::{Rgb, RgbImage};
 use serde_json::json;
@@ -81,6 +81,22 @@ fn a_plant_without_a_single_gap_is_mapped() {
         survey.modules().iter().map(|module| module["properties"]["bench"].to_string()).collect();
     assert_eq!(labels.len(), 1, "{labels:?}");
     assert!(survey.modules().len() >= 30);
+}
+
+#[test]
+fn poor_boxes_and_images_without_any_are_told() {
+    let survey = Survey::new();
+    let mut boxes = true_boxes(|_| true);
+    let images = boxes["images"].as_array_mut().unwrap();
+    images.retain(|image| image["image"] != "DJI_0003.jpg");
+    let thin = json!({"corners": [[9, 9], [9, 9], [9, 9], [9, 9]]});
+    let first = images.iter_mut().find(|image| image["image"] == "DJI_0001.jpg").unwrap();
+    first["boxes"].as_array_mut().unwrap().push(thin);
+    survey.change_boxes(boxes);
+    survey.maps_with_warnings(
+        true,
+        &[("boxes_unusable", &["DJI_0001.jpg"]), ("images_without_boxes", &["DJI_0003.jpg"])],
+    );
 }
 
 #[test]

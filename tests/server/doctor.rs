@@ -82,8 +82,11 @@ fn each_thing_that_is_wrong_is_named() {
     assert_fails(ask(&["--listen", "0.0.0.0:8080", "--insecure"]), "configuration", "no loopback address");
     assert_fails(ask(&["--disk-reserve", "9000000T"]), "data folder", "--disk-reserve");
     assert_fails(ask(&["--detector", "/nowhere.onnx"]), "detector", "nowhere.onnx");
+    let advice = |(_, checks): (bool, Vec<Value>)| checks[4]["advice"].to_string();
+    assert!(!advice(ask(&["--detector", "/nowhere.onnx"])).contains("ORT_DYLIB_PATH"));
     let library = [("ORT_DYLIB_PATH", "/nowhere/libonnxruntime.so")];
     assert_fails(examine(data.path(), &library, &[]), "detector", "/nowhere/libonnxruntime.so");
+    assert!(advice(examine(data.path(), &library, &[])).contains("ORT_DYLIB_PATH"));
     let provider = ["--oidc-issuer", "http://127.0.0.1:9", "--oidc-audience", "heliomap"];
     assert_fails(ask(&provider), "identity provider", "http://127.0.0.1:9");
     let unreachable = ["--database", "postgres://heliomap:pa55w0rd@127.0.0.1:9/heliomap"];

@@ -219,6 +219,33 @@ fn a_worker_of_its_own_takes_the_jobs_of_a_server_without_one() {
 }
 
 #[test]
+fn a_detector_that_is_named_must_be_there() {
+    let data = tempfile::tempdir().unwrap();
+    for command in [&["serve", "--insecure", "--listen", "127.0.0.1:0"][..], &["worker"]] {
+        let mut program = Command::new(env!("CARGO_BIN_EXE_heliomap"));
+        program.args(command).args(["--detector", "/no/such.onnx"]).env("HELIOMAP_DATA_DIR", data.path());
+        let output = program.output().unwrap();
+        let text = String::from_utf8(output.stderr).unwrap();
+        assert!(output.status.code() == Some(1) && text.contains("/no/such.onnx cannot be read"), "{text}");
+    }
+    let _no_worker_needs_none = serve(data.path(), &["--no-worker", "--detector", "/no/such.onnx"]);
+}
+
+#[test]
+fn without_the_shipped_detector_the_service_runs_and_says_so() {
+    let folder = tempfile::tempdir().unwrap();
+    let alone = folder.path().join("heliomap");
+    std::fs::copy(env!("CARGO_BIN_EXE_heliomap"), &alone).unwrap();
+    let mut command = Command::new(alone);
+    command.args(["serve", "--insecure", "--listen", "127.0.0.1:0", "--data-dir", "data"]);
+    command.current_dir(folder.path()).env_remove("ORT_DYLIB_PATH");
+    let (_program, base) = listening(command, Stdio::null());
+    let ready: Value = client().get(format!("{base}/ready")).send().unwrap().json().unwrap();
+    assert_eq!(ready["status"], "ok");
+    assert!(ready["warnings"][0].as_str().unwrap().contains("heliomap doctor"), "{ready}");
+}
+
+#[test]
 fn a_broken_reconstruction_fails_its_job() {
     let data = tempfile::tempdir().unwrap();
     let client = client();
@@ -269,6 +296,52 @@ fn mistakes_on_the_command_line_say_what_to_do() {
     assert!(!ok && text.contains("256M"), "{text}");
     let (ok, text) = run(&["serve", "--data-dir", "/dev/null/x"]);
     assert!(!ok && text.contains("--data-dir"), "{text}");
+    let (ok, text) = run(&["detect", "/no/such/photo.jpg"]);
+    assert!(
+        !ok && text.trim_end().ends_with("/no/such/photo.jpg cannot be read: No such file or directory (os error 2)"),
+        "{text}"
+    );
+    let create = ["keys", "create", "--scope", "read", "--data-dir", "/no/such"];
+    for wrong in [&["--name", ""][..], &["--name", "a", "--organisation", " "], &["--name", "a", "--days", "0"]] {
+        let (ok, text) = run(&[&create[..], wrong].concat());
+        assert!(!ok && text.contains("invalid value"), "{wrong:?}: {text}");
+    }
+}
+
+#[test]
+fn commands_that_read_make_no_data_folder() {
+    let folder = tempfile::tempdir().unwrap();
+    let data = folder.path().join("typo");
+    for arguments in [&["verify"][..], &["keys", "list"], &["organisations", "list"]] {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_heliomap"));
+        let output = command.args(arguments).arg("--data-dir").arg(&data).output().unwrap();
+        let text = String::from_utf8(output.stderr).unwrap();
+        assert!(output.status.code() == Some(1) && text.contains("--data-dir"), "{arguments:?}: {text}");
+        assert!(!data.exists(), "{arguments:?}");
+    }
+}
+
+/// What a command leaves behind whose reader has gone before it prints.
+fn unread(arguments: &[&str], data: &Path) -> std::process::Output {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_heliomap"));
+    let (reader, writer) = std::io::pipe().unwrap();
+    drop(reader);
+    command.args(arguments).env("HELIOMAP_DATA_DIR", data).stdout(writer).output().unwrap()
+}
+
+#[test]
+fn a_reader_who_goes_is_no_fault_but_no_secret_is_lost() {
+    let data = tempfile::tempdir().unwrap();
+    let organisation = unread(&["organisations", "create", "Sun"], data.path());
+    assert_eq!((organisation.status.code(), organisation.stderr.len()), (Some(0), 0), "{organisation:?}");
+    assert_eq!(unread(&["openapi"], data.path()).status.code(), Some(0));
+    let lost = unread(&["keys", "create", "--name", "lost", "--scope", "read"], data.path());
+    let text = String::from_utf8(lost.stderr).unwrap();
+    assert!(lost.status.code() == Some(1) && text.contains("it is revoked"), "{text}");
+    let mut command = Command::new(env!("CARGO_BIN_EXE_heliomap"));
+    let listed = command.args(["keys", "list", "--data-dir"]).arg(data.path()).output().unwrap();
+    let listed = String::from_utf8(listed.stdout).unwrap();
+    assert!(listed.contains("revoked") && listed.contains("lost"), "{listed}");
 }
 
 #[test]

@@ -11,6 +11,8 @@ use std::io::{BufReader, Read};
 use std::path::{Path, PathBuf};
 
 const MAX_BYTES: u64 = 1 << 30;
+/// A label of a photo has no coordinate beyond this, pixels.
+const MAX_COORDINATE_PX: f64 = 1e6;
 
 /// A photo whose modules are known.
 #[derive(Debug, Clone)]
@@ -164,7 +166,7 @@ pub fn read_labels(path: &Path, images: Option<&Path>) -> Result<Vec<LabelledPho
             column: error.column(),
             reason: error.to_string(),
         })?;
-    let folder = path.parent().unwrap_or(Path::new("."));
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let beside = folder.join("images");
     let images = images.unwrap_or(if beside.is_dir() { &beside } else { folder });
     let group = group_name(folder);
@@ -271,6 +273,10 @@ fn of_polygons(
             continue;
         };
         let (width, height) = size_of(&path, &name)?;
+        let points = labels.modules.iter().flatten().chain(labels.ignore.iter().flatten());
+        if let Some([x, y]) = points.copied().find(|point| point.iter().any(|value| value.abs() > MAX_COORDINATE_PX)) {
+            return Err(wrong(format!("the point ({x}, {y}) of {name} lies beyond any photo")));
+        }
         let modules = labels
             .modules
             .iter()
@@ -355,6 +361,7 @@ mod tests {
             (json!({"a": {"modules": "many"}}), "invalid type"),
             (json!({"shots": []}), "missing field"),
             (flat, "no quadrilateral"),
+            (json!({"a": {"modules": [[[0, 0], [1e300, 0], [1e300, 1e300], [0, 1e300]]]}}), "beyond any photo"),
             (json!({"b": {"modules": []}}), "none of its photos"),
         ] {
             let folder = folder_with(&labels, &["a.png"]);

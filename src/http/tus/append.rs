@@ -25,7 +25,7 @@ const STEP: u64 = 8 << 20;
 /// Send more of an upload (tus 1.0)
 ///
 /// What came counts even where the line breaks; with `Upload-Checksum` (`sha1` or `sha256`) only as a whole. The answer to
-/// the last bytes tells whether the file was stored.
+/// the last bytes tells whether the file was stored; no bytes at the end of a whole upload are told it again.
 #[utoipa::path(
     patch,
     path = "/api/v1/plants/{plant}/surveys/{survey}/uploads/{upload}",
@@ -71,7 +71,12 @@ pub(super) async fn add(
     // Whoever had it may have made more safe on the way out.
     let (taken, mut upload) = take(state, path, headers).await?;
     announced.require_fits(&upload)?;
-    receive(state, &mut upload, body.into_data_stream(), announced.checksum, &taken.interrupt).await?;
+    let body = body.into_data_stream();
+    match upload.received == upload.length {
+        // Its file may be gone already: a request whose answer was lost comes again.
+        true => nothing_more(state, &upload, body, announced.checksum).await?,
+        false => receive(state, &mut upload, body, announced.checksum, &taken.interrupt).await?,
+    }
     if upload.received == upload.length {
         finish(state, path.plant, &upload).await?;
     }
@@ -119,6 +124,37 @@ fn too_much(length: u64) -> ApiError {
     wrong(format!("there is more than the {length} bytes that were announced"))
 }
 
+/// Refuses what comes to an upload that is whole, unless it is nothing; and where the whole was refused, says so again.
+async fn nothing_more(
+    state: &AppState,
+    upload: &Upload,
+    mut body: BodyDataStream,
+    checksum: Option<Checksum>,
+) -> Result<(), ApiError> {
+    loop {
+        match tokio::time::timeout(state.limits.request_timeout, body.next()).await {
+            Ok(None) => break,
+            Ok(Some(Ok(chunk))) if chunk.is_empty() => {}
+            Ok(Some(Ok(_))) => return Err(too_much(upload.length)),
+            Ok(Some(Err(_))) => return Err(line_broke()),
+            Err(_) => return Err(stalled()),
+        }
+    }
+    checksum.and_then(Checksum::mismatch).map_or(Ok(()), Err)?;
+    match super::outcome(upload)?.and_then(|outcome| outcome.problem) {
+        Some(problem) => Err(ApiError::told_before(&problem)),
+        None => Ok(()),
+    }
+}
+
+fn line_broke() -> ApiError {
+    ApiError::new(Code::UploadInterrupted, "the line broke; ask with HEAD where to go on")
+}
+
+fn stalled() -> ApiError {
+    ApiError::new(Code::UploadStalled, "nothing came; ask with HEAD where to go on")
+}
+
 /// Appends what comes to an upload's file, and says in `upload` how much of it is safe.
 async fn receive(
     state: &AppState,
@@ -146,10 +182,8 @@ async fn receive(
         let chunk = match next {
             Ok(None) => break None,
             Ok(Some(Ok(chunk))) => chunk,
-            Ok(Some(Err(_))) => {
-                break Some(ApiError::new(Code::UploadInterrupted, "the line broke; ask with HEAD where to go on"));
-            }
-            Err(_) => break Some(ApiError::new(Code::UploadStalled, "nothing came; ask with HEAD where to go on")),
+            Ok(Some(Err(_))) => break Some(line_broke()),
+            Err(_) => break Some(stalled()),
         };
         if chunk.len() as u64 > upload.length - at {
             break Some(too_much(upload.length));

@@ -104,12 +104,7 @@ impl FromStr for UploadState {
 
 impl UploadView {
     fn of(plant: PlantId, upload: Upload) -> Result<Self, ApiError> {
-        let outcome: Option<Outcome> = upload
-            .outcome
-            .as_deref()
-            .map(serde_json::from_str)
-            .transpose()
-            .map_err(|error| ApiError::internal(&error))?;
+        let outcome = outcome(&upload)?;
         Ok(Self {
             id: upload.id,
             location: place(plant, upload.survey, upload.id),
@@ -260,6 +255,12 @@ pub async fn get(
     state.require_survey(path.plant, path.survey).await?;
     let upload = require_upload(&state, path.survey, path.upload).await?;
     UploadView::of(path.plant, upload).map(Json)
+}
+
+/// What became of an upload's file, where that is known.
+fn outcome(upload: &Upload) -> Result<Option<Outcome>, ApiError> {
+    let outcome = upload.outcome.as_deref().map(serde_json::from_str).transpose();
+    outcome.map_err(|error| ApiError::internal(&error))
 }
 
 /// End an upload and forget it (tus 1.0)
