@@ -6,6 +6,7 @@ use heliomap::store::freeing::free_unused;
 use jiff::{SignedDuration, Timestamp};
 use reqwest::StatusCode;
 use serde_json::json;
+use std::cell::Cell;
 use std::time::Duration;
 
 /// Whether a plant keeps these bytes.
@@ -88,4 +89,59 @@ async fn that_are_just_being_deleted_come_anew() {
     let ((status, answer), ()) = futures::future::join(upload, delete).await;
     assert_eq!(status, StatusCode::CREATED, "{answer}");
     assert_eq!((keeps(&app, &survey, &old), kept_bytes(&app).await), (true, old.len() + new.len()));
+}
+
+/// Clients send the same few photos over each other while whatever nothing names is deleted at once: what the surveys name is
+/// there, and nothing else.
+#[tokio::test]
+async fn never_go_while_something_names_them() {
+    let app = App::new(&[]).await;
+    let june = app.survey().await;
+    let (_, july) = app.post(&format!("{}/surveys", plant_path(&june)), json!({"name": "July"})).await;
+    let surveys = [june.clone(), format!("{}/surveys/{}", plant_path(&june), july["id"].as_str().unwrap())];
+    let photos: Vec<Vec<u8>> = (8..13).map(|width| jpeg(width, 8)).collect();
+    let mut most = 0;
+    for round in 0..20 {
+        let uploads = (0..8).map(|client| {
+            let turn = client * 7 + round * 17;
+            let (path, photo) = (format!("{}/images/{}.jpg", surveys[turn % 2], turn % 3), photos[turn % 5].clone());
+            let app = &app;
+            async move {
+                let (status, answer) = app.put(&path, photo).await;
+                // Where nothing is kept for any time, the bytes of an upload may go before they have a name.
+                assert!(status.is_success() || answer["code"] == "unavailable", "{answer}");
+            }
+        });
+        let done = Cell::new(false);
+        let uploads = async {
+            futures::future::join_all(uploads).await;
+            done.set(true);
+        };
+        let freeing = async {
+            while !done.get() {
+                free(&app).await;
+                tokio::task::yield_now().await;
+            }
+            free(&app).await;
+        };
+        futures::future::join(uploads, freeing).await;
+        most = most.max(what_is_named_is_there(&app, &surveys, &photos).await);
+    }
+    assert!(most > 1, "{most}");
+}
+
+/// And nothing else; how many photos that are.
+async fn what_is_named_is_there(app: &App, surveys: &[String; 2], photos: &[Vec<u8>]) -> usize {
+    let mut named = std::collections::BTreeSet::new();
+    for survey in surveys {
+        for file in app.get(survey).await.1["files"].as_array().unwrap() {
+            named.insert(file["sha256"].as_str().unwrap().to_owned());
+        }
+    }
+    for photo in photos {
+        assert_eq!(keeps(app, &surveys[0], photo), named.contains(&Digest::of(photo).to_string()));
+    }
+    let sizes = photos.iter().filter(|photo| named.contains(&Digest::of(photo).to_string())).map(Vec::len);
+    assert_eq!(kept_bytes(app).await, sizes.sum::<usize>());
+    named.len()
 }
