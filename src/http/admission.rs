@@ -2,6 +2,7 @@
 //! run have room for what they write, and the organisation's quota holds.
 
 use super::AppState;
+use super::encoding;
 use super::error::{ApiError, Code};
 use super::guard::{Caller, refuse};
 use super::usage;
@@ -21,6 +22,9 @@ const LOOK_EVERY_BYTES: u64 = 16 << 20;
 pub async fn admit(State(state): State<AppState>, request: Request, next: Next) -> Response {
     if !matches!(*request.method(), Method::PUT | Method::POST | Method::PATCH) {
         return next.run(request).await;
+    }
+    if let Err(problem) = encoding::require_as_it_is(request.method(), request.headers()) {
+        return refuse(request, problem).await;
     }
     let bytes = announced(request.headers(), &state.limits);
     // What goes on with an upload was counted when it began.

@@ -52,10 +52,12 @@ codes! {
     DeliveryNotFound = NOT_FOUND, "delivery_not_found", "There is no such message";
     ModuleNotFound = NOT_FOUND, "module_not_found", "There is no such module";
     MethodNotAllowed = METHOD_NOT_ALLOWED, "method_not_allowed", "The method does not apply here";
+    NotAcceptable = NOT_ACCEPTABLE, "not_acceptable", "No answer can be sent in that way";
     Timeout = REQUEST_TIMEOUT, "timeout", "The request took too long";
     UploadStalled = REQUEST_TIMEOUT, "upload_stalled", "The upload stood still";
     SurveyIncomplete = CONFLICT, "survey_incomplete", "The survey cannot be mapped yet";
     JobFinished = CONFLICT, "job_finished", "The job has ended";
+    KeyRevoked = CONFLICT, "key_revoked", "The key is revoked";
     JobStopping = CONFLICT, "job_stopping", "The survey's cancelled job has not stopped yet";
     TooManyWebhooks = CONFLICT, "too_many_webhooks", "There are as many webhooks as there may be";
     IdempotencyBusy = CONFLICT, "idempotency_busy", "The request is being answered";

@@ -298,7 +298,7 @@ pub async fn revoke(
     responses(
         (status = 200, description = "The key with its new secret", body = KeyWithSecret),
         (status = 412, description = "`precondition_failed`", body = Problem, content_type = "application/problem+json"),
-        (status = "4XX", description = "`key_not_found` (a revoked one, too), `invalid_json`, `invalid_fields`, \
+        (status = "4XX", description = "`key_not_found`, `key_revoked`, `invalid_json`, `invalid_fields`, \
             `unsupported_media_type`, `too_large`", body = Problem, content_type = "application/problem+json")
     )
 )]
@@ -318,7 +318,16 @@ pub async fn rotate(
     let secret = new_secret()?;
     let until = Timestamp::now() + grace;
     let key = state.store.rotate_key(caller.organisation, id, seen.as_deref(), &secret.record(), until).await?;
-    let key = key.ok_or_else(|| not_as_seen(seen.as_deref(), id))?;
+    let Some(key) = key else {
+        let there = state.store.key(caller.organisation, id).await?;
+        return Err(match there.and_then(|key| key.revoked) {
+            Some(revoked) if seen.is_none() => {
+                let what = format!("key {id} was revoked at {revoked:.0}; make another with POST /api/v1/keys");
+                ApiError::new(Code::KeyRevoked, what)
+            }
+            _ => not_as_seen(seen.as_deref(), id),
+        });
+    };
     Ok(Json(KeyWithSecret { secret: secret.reveal().to_owned(), key: key.into() }))
 }
 

@@ -7,6 +7,7 @@ pub mod state;
 mod admission;
 mod conditional;
 mod docs;
+mod encoding;
 mod events;
 mod extract;
 mod features;

@@ -1,7 +1,7 @@
 //! The web page, embedded in the program.
 
 use super::error::{ApiError, Code};
-use axum::http::{Method, Uri, header};
+use axum::http::{HeaderName, Method, Uri, header};
 use axum::response::{Html, IntoResponse, Response};
 use rust_embed::RustEmbed;
 
@@ -15,6 +15,18 @@ const PLAIN: &str = "<!doctype html><html lang=en><meta charset=utf-8><title>hel
     <h1>heliomap</h1><p>This service maps photovoltaic plants from drone overview photos. \
     It was built without its web page; the API works: see <a href=/openapi.yaml>its description</a>, \
     <a href=/api/v1/plants>the plants</a>, and <code>docs/API.md</code>.</p></html>";
+
+/// The page keeps a key: it runs no script, loads nothing and tells nothing but from and to where it came from, and stands
+/// in no frame. The map draws pictures that it makes itself.
+const GUARDED: [(HeaderName, &str); 3] = [
+    (
+        header::CONTENT_SECURITY_POLICY,
+        "default-src 'none'; script-src 'self'; worker-src 'self' blob:; style-src 'self'; img-src 'self' data: blob:; \
+         connect-src 'self' blob:; base-uri 'none'; form-action 'self'; frame-ancestors 'none'",
+    ),
+    (header::X_FRAME_OPTIONS, "DENY"),
+    (header::REFERRER_POLICY, "no-referrer"),
+];
 
 /// A file of the page, or a problem.
 pub async fn serve(method: Method, uri: Uri) -> Response {
@@ -34,9 +46,9 @@ pub async fn serve(method: Method, uri: Uri) -> Response {
                 (header::CONTENT_TYPE, file.metadata.mimetype().to_owned()),
                 (header::CACHE_CONTROL, caching.to_owned()),
             ];
-            (headers, file.data).into_response()
+            (headers, GUARDED, file.data).into_response()
         }
-        None if path == "index.html" && method == Method::GET => Html(PLAIN).into_response(),
+        None if path == "index.html" && method == Method::GET => (GUARDED, Html(PLAIN)).into_response(),
         None => ApiError::new(
             Code::NotFound,
             format!("{method} {} leads nowhere; /openapi.yaml tells what this service offers", uri.path()),

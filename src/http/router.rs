@@ -2,8 +2,8 @@
 
 use super::guard::{Gate, Policy};
 use super::{
-    AppState, admission, conditional, docs, error, events, features, guard, health, idempotency, images, jobs, keys,
-    models, page, plants, surveys, tus, uploads, usage, webhooks,
+    AppState, admission, conditional, docs, encoding, error, events, features, guard, health, idempotency, images,
+    jobs, keys, models, page, plants, surveys, tus, uploads, usage, webhooks,
 };
 use crate::config::NetworkArgs;
 use crate::telemetry::metrics::RequestLabels;
@@ -11,7 +11,7 @@ use crate::telemetry::{Metrics, traces};
 use axum::Router;
 use axum::body::Body;
 use axum::extract::{DefaultBodyLimit, MatchedPath, Request, State};
-use axum::http::{HeaderName, HeaderValue, Method, StatusCode};
+use axum::http::{HeaderName, HeaderValue, Method, StatusCode, header};
 use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
 use std::sync::Arc;
@@ -135,6 +135,8 @@ pub fn router(state: AppState) -> Router {
         .layer(middleware::map_response(error::only_problems))
         // A plant is megabytes of JSON, which little effort makes small.
         .layer(CompressionLayer::new().quality(CompressionLevel::Fastest))
+        .layer(middleware::from_fn(encoding::acceptable))
+        .layer(middleware::map_response(as_it_says))
         .layer(tower::util::option_layer(cors))
         .layer(PropagateRequestIdLayer::new(REQUEST_ID))
         .layer(TraceLayer::new_for_http().make_span_with(span).on_response(log_response).on_failure(()))
@@ -159,6 +161,12 @@ fn cors(network: &NetworkArgs) -> Option<CorsLayer> {
             .expose_headers(exposed.map(HeaderName::from_static).collect::<Vec<_>>())
             .max_age(Duration::from_secs(3600))
     })
+}
+
+/// What is answered is what its type says, whatever it looks like to a browser.
+async fn as_it_says(mut response: Response) -> Response {
+    response.headers_mut().insert(header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
+    response
 }
 
 /// Counts requests by their routes.

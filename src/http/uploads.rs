@@ -78,7 +78,7 @@ pub fn uploaded(stored: Stored) -> UploadedFile {
         (status = 412, description = "`precondition_failed`", body = Problem, content_type = "application/problem+json"),
         (status = "4XX", description = "`plant_not_found`, `survey_not_found`, `invalid_name`, `too_large`, `image_too_large`, \
             `image_format_mismatch`, `image_unreadable`, `image_truncated`, `upload_interrupted`, `upload_stalled`, \
-            `bad_request`, `checksum_mismatch`", body = Problem, content_type = "application/problem+json"),
+            `bad_request`, `unsupported_media_type` (a coded body), `checksum_mismatch`", body = Problem, content_type = "application/problem+json"),
         (status = 507, description = "`storage_full`, `quota_exceeded`", body = Problem, content_type = "application/problem+json")
     )
 )]
@@ -118,7 +118,8 @@ pub async fn put_image(
         (status = 412, description = "`precondition_failed`", body = Problem, content_type = "application/problem+json"),
         (status = "4XX", description = "`plant_not_found`, `survey_not_found`, `unknown_file`, `invalid_name`, `too_large`, \
             `file_unreadable`, `image_too_large`, `image_format_mismatch`, `image_unreadable`, `image_truncated`, \
-            `upload_interrupted`, `upload_stalled`, `bad_request`, `checksum_mismatch`", body = Problem, content_type = "application/problem+json"),
+            `upload_interrupted`, `upload_stalled`, `bad_request`, `unsupported_media_type` (a coded body), \
+            `checksum_mismatch`", body = Problem, content_type = "application/problem+json"),
         (status = 507, description = "`storage_full`, `quota_exceeded`", body = Problem, content_type = "application/problem+json")
     )
 )]
@@ -313,7 +314,7 @@ struct PhotoForm {
         (status = "4XX", description = "`plant_not_found`, `survey_not_found`, `unsupported_archive`, `archive_unsafe`, \
             `archive_unreadable`, `archive_empty`, `archive_too_large`, `too_large`, `invalid_name`, `file_unreadable`, \
             `image_too_large`, `image_format_mismatch`, `image_unreadable`, `image_truncated`, `upload_interrupted`, \
-            `upload_stalled`, `bad_request`, `checksum_mismatch`", body = Problem, content_type = "application/problem+json"),
+            `upload_stalled`, `bad_request`, `unsupported_media_type` (a coded body), `checksum_mismatch`", body = Problem, content_type = "application/problem+json"),
         (status = 507, description = "`storage_full`, `quota_exceeded`", body = Problem, content_type = "application/problem+json")
     )
 )]

@@ -54,9 +54,18 @@ impl Targets {
         let address = host.trim_start_matches('[').trim_end_matches(']').parse::<IpAddr>();
         match address {
             Ok(address) if self == Self::Public && !is_public(address) => Err(TargetError::Private(address)),
+            Err(_) if self == Self::Public && is_local_name(host) => Err(TargetError::PrivateName(host.to_owned())),
             _ => Ok(url),
         }
     }
+}
+
+/// Whether a host's name is one of this machine or its network, whatever it leads to: without a dot, or of a domain that is
+/// reserved for that (RFC 6761, 6762, 8375, and `internal` by ICANN).
+fn is_local_name(host: &str) -> bool {
+    let host = host.trim_end_matches('.').to_ascii_lowercase();
+    let is_of = |domain: &str| host.strip_suffix(domain).is_some_and(|rest| rest.is_empty() || rest.ends_with('.'));
+    !host.contains('.') || ["localhost", "local", "internal", "home.arpa"].into_iter().any(is_of)
 }
 
 impl Resolve for Targets {
@@ -184,7 +193,14 @@ mod tests {
             let refused = public(&format!("https://{host}/"));
             assert!(matches!(refused, Err(TargetError::Private(_))), "{host}: {refused:?}");
         }
-        assert!(Targets::Any.check("http://127.0.0.1:8080/").is_ok());
+        for host in ["localhost", "LOCALHOST.", "a.localhost", "nas.local", "intranet", "metadata.google.internal"] {
+            let refused = public(&format!("https://{host}/x"));
+            assert!(matches!(refused, Err(TargetError::PrivateName(_))), "{host}: {refused:?}");
+        }
+        assert!(public("https://notlocal.example.org/").is_ok());
+        assert!(
+            Targets::Any.check("http://127.0.0.1:8080/").is_ok() && Targets::Any.check("http://localhost/").is_ok()
+        );
     }
 
     #[tokio::test]

@@ -81,7 +81,7 @@ async fn keys_end_are_revoked_and_rotated() {
     assert_eq!((status, revoked["revoked"].is_string()), (StatusCode::OK, true));
     assert_eq!(delete(&app, &path).await.1, revoked);
     assert_eq!(plants(&mut app, &third).await, StatusCode::UNAUTHORIZED);
-    assert_problem(app.post(&format!("{path}/rotate"), json!({})).await, 404, "key_not_found", "lists them");
+    assert_problem(app.post(&format!("{path}/rotate"), json!({})).await, 409, "key_revoked", "make another");
 
     tokio::time::sleep(std::time::Duration::from_millis(350)).await;
     assert_eq!(plants(&mut app, &short).await, StatusCode::UNAUTHORIZED);

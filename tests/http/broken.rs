@@ -302,7 +302,12 @@ async fn boxes_that_come_with_a_survey_stand_in_the_place_of_a_detector() {
     let mut flat = boxes.clone();
     flat["images"][1]["boxes"][3]["corners"] = json!([[1, 1], [2, 2], [3, 3], [4, 4]]);
     let files = Files::new().with("boxes.json", flat.to_string());
-    fails(&app, &files, "boxes_invalid", &["boxes.json: box 3 of DJI_0002.jpg", "no convex quadrilateral"]).await;
+    succeeds(&app, &files, &["no_dense_cloud", "boxes_unusable"]).await;
+    let nothing_else = &mut flat["images"].as_array_mut().unwrap()[1];
+    *nothing_else["boxes"].as_array_mut().unwrap() = vec![nothing_else["boxes"][3].clone()];
+    let nothing_else = json!({"images": [nothing_else]});
+    let files = Files::new().with("boxes.json", nothing_else.to_string());
+    fails(&app, &files, "boxes_invalid", &["boxes.json: box 0 of DJI_0002.jpg", "no convex quadrilateral"]).await;
 
     let files = Files::new().with("boxes.json", "{\"images\": 7}");
     fails(&app, &files, "boxes_invalid", &["boxes.json is not a file of boxes"]).await;

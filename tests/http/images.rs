@@ -129,3 +129,17 @@ async fn an_upload_that_stands_still_is_ended() {
     assert!(answer.starts_with("HTTP/1.1 408") && answer.contains("upload_stalled"), "{answer}");
     assert_eq!(incoming(&app), 0);
 }
+
+#[tokio::test]
+async fn parts_of_files_and_coded_ones_are_no_files() {
+    let app = App::new(&[]).await;
+    let survey = app.survey().await;
+    let put = async |name: &'static str, value: &'static str| {
+        let request = app.request(Method::PUT, &format!("{survey}/images/a.jpg")).header(name, value);
+        json_of(request.body(jpeg(16, 12)).send().await.unwrap()).await
+    };
+    assert_problem(put("content-range", "bytes 0-99/1000").await, 400, "bad_request", "by tus");
+    assert_problem(put("content-encoding", "gzip").await, 415, "unsupported_media_type", "as they come");
+    assert_eq!(app.get(&survey).await.1["files"], json!([]));
+    assert_eq!(put("content-encoding", "identity").await.0, StatusCode::CREATED);
+}

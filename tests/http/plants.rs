@@ -84,6 +84,8 @@ async fn every_wrong_request_is_a_problem() {
     assert_problem(app.post("/api/v1/plants", json!({"nam": "x"})).await, 422, "invalid_fields", "nam");
     assert_problem(app.post("/api/v1/plants", json!(["x"])).await, 422, "invalid_fields", "an object");
     assert_problem(app.post("/api/v1/plants", json!({"name": ""})).await, 422, "invalid_name", "1 to 200");
+    let turned = json!({"name": "Sunfield\u{202e}htroN"});
+    assert_problem(app.post("/api/v1/plants", turned).await, 422, "invalid_name", "steer how text is shown");
     let large = json!({"name": "x".repeat(2 << 20)});
     assert_problem(app.post("/api/v1/plants", large).await, 413, "too_large", "");
 }
@@ -102,6 +104,27 @@ async fn the_service_tells_how_it_is() {
     let (status, page) = app.get("/").await;
     assert_eq!(status, StatusCode::OK);
     assert!(page.as_str().unwrap().contains("heliomap"));
+    let page = app.request(Method::GET, "/").send().await.unwrap();
+    let policy = page.headers()["content-security-policy"].to_str().unwrap();
+    assert!(policy.contains("default-src 'none'") && policy.contains("frame-ancestors 'none'"), "{policy}");
+    assert_eq!(
+        (&page.headers()["x-frame-options"], &page.headers()["x-content-type-options"]),
+        (&"DENY".parse().unwrap(), &"nosniff".parse().unwrap())
+    );
     std::fs::remove_dir_all(app.folder.path().join("blobs")).unwrap();
     assert_problem(app.get("/ready").await, 503, "unavailable", "storage");
+}
+
+#[tokio::test]
+async fn answers_come_as_they_can_be_read() {
+    let app = App::new(&[]).await;
+    let ask = async |codings: &'static str| {
+        app.request(Method::GET, "/openapi.yaml").header("accept-encoding", codings).send().await.unwrap()
+    };
+    for (codings, sent) in [("gzip", "gzip"), ("identity;q=0", "gzip"), ("identity", "")] {
+        let answer = ask(codings).await;
+        let coding = answer.headers().get("content-encoding").map_or("", |coding| coding.to_str().unwrap());
+        assert_eq!((answer.status(), coding), (StatusCode::OK, sent), "{codings}");
+    }
+    assert_problem(json_of(ask("*;q=0").await).await, 406, "not_acceptable", "accept-encoding");
 }

@@ -179,11 +179,14 @@ async fn messages_go_to_public_addresses_alone() {
     let answer = request.json(&json!({"url": "https://example.org/"})).send().await.unwrap();
     assert_problem(json_of(answer).await, 400, "bad_request", "secret");
 
-    // A name is public until it is looked up.
-    let (webhook, _) = register(&strict, json!({"url": "https://localhost:9/"})).await;
+    let local = ask(json!({"url": "https://localhost/x"})).await;
+    assert_problem(local, 422, "webhook_url", "localhost leads to no public address");
+
+    // One that was registered while any address was taken.
+    let (webhook, _) = register(&app, json!({"url": "https://localhost:9/"})).await;
     let _sending = sender(&app, Targets::Public, Metrics::default());
     let survey = app.complete_survey().await;
     app.map(&survey).await;
     let dead = delivery_in(&app, &webhook, "dead").await;
-    assert_eq!(dead["error"], "no connection: localhost leads to no public address", "{dead}");
+    assert_eq!(dead["error"], "localhost leads to no public address", "{dead}");
 }
