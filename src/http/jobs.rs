@@ -264,12 +264,8 @@ pub async fn start(
     let asked = if body.trim_ascii().is_empty() {
         StartJob::default()
     } else {
-        serde_json::from_slice::<Option<Object<StartJob>>>(&body)
-            .map_err(|error| {
-                let code = if error.is_data() { Code::InvalidFields } else { Code::InvalidJson };
-                ApiError::new(code, format!("the options cannot be read: {error}"))
-            })?
-            .map_or_else(StartJob::default, |Object(asked)| asked)
+        let Json(asked) = Json::<Option<Object<StartJob>>>::from_bytes(&body)?;
+        asked.map_or_else(StartJob::default, |Object(asked)| asked)
     };
     let priority = asked.priority.unwrap_or(0);
     let options = asked.into_options()?;

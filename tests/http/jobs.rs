@@ -118,7 +118,13 @@ async fn options_are_checked() {
     let jobs = format!("{survey}/jobs");
     assert_problem(app.post(&jobs, json!({"rows": 2})).await, 422, "invalid_fields", "rows");
     assert_problem(app.post(&jobs, json!({"rows_per_bench": 0})).await, 422, "invalid_fields", "rows_per_bench");
-    assert_problem(app.post(&jobs, json!({"spacing_m": [1.0]})).await, 422, "invalid_fields", "");
+    assert_problem(app.post(&jobs, json!({"spacing_m": [1.0]})).await, 422, "invalid_fields", "spacing_m");
+    assert_problem(
+        app.post(&jobs, json!({"seed": -1})).await,
+        422,
+        "invalid_fields",
+        "seed: invalid value: integer `-1`",
+    );
     assert_problem(app.post(&jobs, json!({"max_gsd_m_per_px": -1})).await, 422, "invalid_fields", "max_gsd_m_per_px");
     assert_problem(app.post(&jobs, json!([])).await, 422, "invalid_fields", "an object");
     let empty = app.request(reqwest::Method::POST, &jobs).send().await.unwrap();
