@@ -13,6 +13,7 @@ fn the_example_is_mapped_without_a_fault_whatever_the_number_of_threads() {
     let files = ["plant", "plant-sectors", "plant-benches", "plant-lines"];
     let [one, two] = ["1", "2"].map(|threads| {
         let out = folder.path().join(threads).join("plant.geojson");
+        std::fs::create_dir(out.parent().unwrap()).unwrap();
         let said = heliomap(&["map", EXAMPLE, "--out", out.to_str().unwrap(), "--layers", "--threads", threads]);
         assert_eq!(said.code, Some(0), "{}", said.stderr);
         files.map(|name| std::fs::read(out.with_file_name(format!("{name}.geojson"))).unwrap())
