@@ -2,12 +2,11 @@
 
 use super::ids::{BenchId, LineId, ModuleId, PlantId, SectorId};
 use super::model::{Bench, Line, Module, ModuleStatus, PlantModel, Sector, Warning};
+use super::resurvey;
 use crate::fusion::{Doubt, Fused, View};
 use crate::geometry::GeodeticReference;
 use crate::refinement::{Refined, RefinedBench};
-use nalgebra::{Vector2, Vector3};
-use rstar::RTree;
-use rstar::primitives::GeomWithData;
+use nalgebra::Vector3;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 /// What the model is of.
@@ -121,6 +120,7 @@ pub fn assemble(
         }
     }
     warnings.extend(fused.doubts.iter().map(|doubt| warning(doubt, &named)));
+    warnings.extend(registry.warning.take());
     warnings.sort();
     warnings.dedup();
     model.warnings = warnings;
@@ -173,6 +173,8 @@ struct Registry {
     benches: HashMap<usize, BenchId>,
     sectors: HashMap<(usize, i32), SectorId>,
     modules: HashMap<usize, ModuleId>,
+    /// What is not sure about them.
+    warning: Option<Warning>,
 }
 
 impl Registry {
@@ -184,9 +186,13 @@ impl Registry {
             benches: HashMap::new(),
             sectors: HashMap::new(),
             modules: HashMap::new(),
+            warning: None,
         };
         let Some(previous) = previous else { return registry };
-        let pairs = found_again(reference, previous, drafts);
+        let (new, old) = compared(reference, previous, drafts);
+        let found = resurvey::find_again(&new, &old);
+        registry.warning = told(&found, previous.modules.len());
+        let pairs = found.pairs;
         for &(draft, old) in &pairs {
             registry.modules.insert(draft, previous.modules[old].id);
         }
@@ -231,6 +237,22 @@ impl Registry {
     }
 }
 
+/// What a person should know of the identifiers that live on.
+fn told(found: &resurvey::FoundAgain, old_modules: usize) -> Option<Warning> {
+    if old_modules > 0 && found.pairs.is_empty() {
+        let message = "nothing of the model before was found again within 15 m: all identifiers are new; check whether these \
+                       images are of the same plant";
+        return Some(Warning::new("identifiers_new", message, []));
+    }
+    let other_m = found.or_moved_by_m?;
+    let message = format!(
+        "the plant fits the model before as well if it is moved by {:.1} m east and {:.1} m north: the ends of its benches do \
+         not tell which of its modules are which, and identifiers may have moved to neighbours; known places (control) tell",
+        other_m.x, other_m.y
+    );
+    Some(Warning::new("identifiers_unsure", message, []))
+}
+
 /// Each new group takes the old identifier that most of its modules had; of two that want the same, the one with more.
 fn elect<K: Copy + Ord + std::hash::Hash, V: Copy + Ord>(pairs: impl Iterator<Item = (K, V)>) -> HashMap<K, V> {
     let mut votes: BTreeMap<(K, V), usize> = BTreeMap::new();
@@ -249,82 +271,31 @@ fn elect<K: Copy + Ord + std::hash::Hash, V: Copy + Ord>(pairs: impl Iterator<It
     elected
 }
 
-/// Pairs of (draft, old module) that are the same module. GNSS moves one survey against the next by metres, more than a
-/// module: the common shift is found first, by vote among benches of the same shape.
-fn found_again(reference: GeodeticReference, previous: &PlantModel, drafts: &[Draft<'_>]) -> Vec<(usize, usize)> {
-    const REACH_M: f64 = 12.0;
-    const BIN_M: f64 = 0.5;
-    let old_centers: Vec<Vector3<f64>> = previous
+/// Modules of the survey and of the model before, as they are compared: in the frame of the survey.
+fn compared(
+    reference: GeodeticReference,
+    previous: &PlantModel,
+    drafts: &[Draft<'_>],
+) -> (Vec<resurvey::Place>, Vec<resurvey::Place>) {
+    let half_m = |width_m: f64, height_m: f64| 0.5 * width_m.min(height_m);
+    let new = drafts
+        .iter()
+        .map(|draft| resurvey::Place {
+            bench: draft.bench_index,
+            at_m: draft.position.center_m.xy(),
+            reach_m: half_m(draft.bench.module_size_m[0], draft.bench.module_size_m[1]),
+        })
+        .collect();
+    let number: HashMap<BenchId, usize> =
+        previous.benches.iter().enumerate().map(|(index, bench)| (bench.id, index)).collect();
+    let old = previous
         .modules
         .iter()
-        .map(|module| reference.enu_from_lla(previous.reference.lla_from_enu(module.center_enu_m)))
+        .map(|module| resurvey::Place {
+            bench: number.get(&module.bench).copied().unwrap_or(usize::MAX),
+            at_m: reference.enu_from_lla(previous.reference.lla_from_enu(module.center_enu_m)).xy(),
+            reach_m: half_m(module.width_m, module.height_m),
+        })
         .collect();
-    // (rows, columns, modules, middle) of each bench.
-    type Shape = (u32, u32, usize);
-    let mut old: BTreeMap<BenchId, (Vector3<f64>, usize)> = BTreeMap::new();
-    for (module, center) in previous.modules.iter().zip(&old_centers) {
-        let entry = old.entry(module.bench).or_insert((Vector3::zeros(), 0));
-        *entry = (entry.0 + center, entry.1 + 1);
-    }
-    let mut by_shape: BTreeMap<Shape, Vec<Vector2<f64>>> = BTreeMap::new();
-    for bench in &previous.benches {
-        if let Some((sum, count)) = old.get(&bench.id) {
-            let middle = (sum / *count as f64).xy();
-            by_shape.entry((bench.rows, bench.columns, *count)).or_default().push(middle);
-        }
-    }
-    let mut new: BTreeMap<usize, (Vector3<f64>, usize, i32, i32)> = BTreeMap::new();
-    for draft in drafts {
-        let entry = new.entry(draft.bench_index).or_insert((Vector3::zeros(), 0, 0, 0));
-        *entry = (
-            entry.0 + draft.position.center_m,
-            entry.1 + 1,
-            entry.2.max(draft.module.row + 1),
-            entry.3.max(draft.module.col + 1),
-        );
-    }
-    let mut votes: BTreeMap<(i64, i64), (usize, Vector2<f64>)> = BTreeMap::new();
-    for (sum, count, rows, cols) in new.values() {
-        let middle = (sum / *count as f64).xy();
-        for other in by_shape.get(&(*rows as u32, *cols as u32, *count)).into_iter().flatten() {
-            let shift = other - middle;
-            if shift.norm() > REACH_M {
-                continue;
-            }
-            // Half-overlapping bins, so that a shift near a border is not torn apart.
-            for (dx, dy) in [(0.0, 0.0), (0.5, 0.0), (0.0, 0.5), (0.5, 0.5)] {
-                let key = (
-                    ((shift.x / BIN_M + dx).floor() as i64) * 2 + i64::from(dx > 0.0),
-                    ((shift.y / BIN_M + dy).floor() as i64) * 2 + i64::from(dy > 0.0),
-                );
-                let vote = votes.entry(key).or_insert((0, Vector2::zeros()));
-                *vote = (vote.0 + 1, vote.1 + shift);
-            }
-        }
-    }
-    let shift = votes
-        .values()
-        .map(|(count, sum)| (*count, sum / *count as f64))
-        .max_by(|a, b| a.0.cmp(&b.0).then(b.1.norm().total_cmp(&a.1.norm())))
-        .map_or(Vector2::zeros(), |(_, shift)| shift);
-    let tree = RTree::bulk_load(
-        old_centers.iter().enumerate().map(|(index, c)| GeomWithData::new([c.x, c.y], index)).collect(),
-    );
-    let mut candidates: Vec<(f64, usize, usize)> = Vec::new();
-    for (index, draft) in drafts.iter().enumerate() {
-        let at = draft.position.center_m.xy() + shift;
-        if let Some(nearest) = tree.nearest_neighbor([at.x, at.y]) {
-            let distance = (Vector2::from(*nearest.geom()) - at).norm();
-            let size = draft.bench.module_size_m;
-            if distance < 0.5 * size[0].min(size[1]) {
-                candidates.push((distance, index, nearest.data));
-            }
-        }
-    }
-    candidates.sort_by(|a, b| a.0.total_cmp(&b.0).then((a.1, a.2).cmp(&(b.1, b.2))));
-    let mut taken = BTreeSet::new();
-    let mut pairs: Vec<(usize, usize)> =
-        candidates.into_iter().filter(|(_, _, old)| taken.insert(*old)).map(|(_, draft, old)| (draft, old)).collect();
-    pairs.sort_unstable();
-    pairs
+    (new, old)
 }

@@ -4,6 +4,7 @@ pub mod assemble;
 pub mod geojson;
 pub mod ids;
 pub mod model;
+mod resurvey;
 
 pub use geojson::Layer;
 pub use ids::{BenchId, LineId, ModuleId, PlantId, SectorId};
