@@ -15,7 +15,10 @@ use rstar::primitives::GeomWithData;
 const PATCH: usize = 600;
 /// Horizontal offsets are sought this far around nought and around the difference of the centroids, metres.
 const REACH_M: f64 = 12.0;
-const CELL_M: f64 = 0.25;
+/// Offsets are voted for in cells of this part of the gate, so that those of neighbouring modules stay apart, and of at
+/// least and at most so many metres.
+const CELL_OF_GATE: f64 = 0.5;
+const CELL_M: (f64, f64) = (0.06, 0.25);
 /// Scales and rotations (radians) tried where votes are counted; between them the refinement takes over.
 const SCALES: [f64; 5] = [0.98, 0.99, 1.0, 1.01, 1.02];
 const ROTATIONS_RAD: [f64; 5] = [-0.0175, -0.00875, 0.0, 0.00875, 0.0175];
@@ -49,7 +52,12 @@ pub fn pair(plant_m: &[Vector3<f64>], truth_m: &[Vector3<f64>], gates_m: &[f64])
     let truth: Vec<Vector3<f64>> = truth_m.iter().map(|t| t - origin).collect();
     let tree = tree_of(&truth);
     let gate_m = median(gates_m.to_vec())?;
-    let search = Search { plant: plant.iter().map(|p| p.xy()).collect(), tree: &tree, gate_m };
+    let search = Search {
+        plant: plant.iter().map(|p| p.xy()).collect(),
+        tree: &tree,
+        gate_m,
+        cell_m: (CELL_OF_GATE * gate_m).clamp(CELL_M.0, CELL_M.1),
+    };
     let coarse = search.best()?;
 
     let start = level(coarse, &plant, &truth, &one_to_one(&plant, |p| coarse.apply(p), &tree, gates_m))?;
@@ -126,6 +134,7 @@ struct Search<'a> {
     plant: Vec<Vector2<f64>>,
     tree: &'a Tree,
     gate_m: f64,
+    cell_m: f64,
 }
 
 impl Search<'_> {
@@ -172,7 +181,7 @@ impl Search<'_> {
 
     /// The offsets of a patch, and the scale and rotation about its anchor, that most of its modules agree on.
     fn vote(&self, anchor: Vector2<f64>, patch: &[Vector2<f64>], window: Vector2<f64>) -> Vec<PlaneSimilarity> {
-        let cells = (2.0 * REACH_M / CELL_M) as usize;
+        let cells = (2.0 * REACH_M / self.cell_m) as usize;
         let hypotheses: Vec<(f64, f64)> =
             SCALES.iter().flat_map(|&scale| ROTATIONS_RAD.map(|rotation| (scale, rotation))).collect();
         let mut grids = vec![vec![0_u32; cells * cells]; hypotheses.len()];
@@ -186,7 +195,7 @@ impl Search<'_> {
             for (grid, &(scale, rotation_rad)) in grids.iter_mut().zip(&hypotheses) {
                 let moved = PlaneSimilarity::about(anchor, scale, rotation_rad, window).apply_xy(point);
                 for target in &around {
-                    let cell = (target - moved + Vector2::repeat(REACH_M)) / CELL_M;
+                    let cell = (target - moved + Vector2::repeat(REACH_M)) / self.cell_m;
                     if cell.x >= 0.0 && cell.y >= 0.0 && cell.x < cells as f64 && cell.y < cells as f64 {
                         grid[cell.y as usize * cells + cell.x as usize] += 1;
                     }
@@ -203,8 +212,8 @@ impl Search<'_> {
                     if (votes as usize) * 4 >= patch.len()
                         && around.iter().all(|(dx, dy)| blurred[(y + dy - 1) * cells + x + dx - 1] <= votes)
                     {
-                        let offset =
-                            window + Vector2::new(x as f64 + 0.5, y as f64 + 0.5) * CELL_M - Vector2::repeat(REACH_M);
+                        let offset = window + Vector2::new(x as f64 + 0.5, y as f64 + 0.5) * self.cell_m
+                            - Vector2::repeat(REACH_M);
                         peaks.push((votes, offset.norm(), hypothesis, offset));
                     }
                 }
@@ -213,7 +222,7 @@ impl Search<'_> {
         peaks.sort_by(|a, b| b.0.cmp(&a.0).then(a.1.total_cmp(&b.1)).then(a.2.cmp(&b.2)));
         let mut kept: Vec<(usize, Vector2<f64>)> = Vec::new();
         for (_, _, hypothesis, offset) in peaks {
-            if kept.iter().all(|(_, other)| (other - offset).norm() > 2.0 * CELL_M) {
+            if kept.iter().all(|(_, other)| (other - offset).norm() > 2.0 * self.cell_m) {
                 kept.push((hypothesis, offset));
             }
             if kept.len() == 24 {
@@ -409,4 +418,25 @@ fn median(mut values: Vec<f64>) -> Option<f64> {
     }
     let middle = values.len() / 2;
     Some(*values.select_nth_unstable_by(middle, f64::total_cmp).1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn narrow_modules_pair_with_themselves() {
+        // Thin film of 0.6 x 1.2 m, four rows, benches one behind the other.
+        let plant: Vec<Vector3<f64>> = (0..320)
+            .map(|k| {
+                let (bench, column, row) = (k / 80, k % 20, k / 20 % 4);
+                Vector3::new(0.62 * f64::from(column) + 13.5 * f64::from(bench), -1.22 * f64::from(row), 0.0)
+            })
+            .collect();
+        let itself: Vec<(usize, usize)> = (0..plant.len()).map(|k| (k, k)).collect();
+        for shift in [Vector3::zeros(), Vector3::new(0.9, -0.4, 1.0)] {
+            let moved: Vec<Vector3<f64>> = plant.iter().map(|p| p + shift).collect();
+            assert_eq!(pair(&moved, &plant, &[0.3; 320]).as_deref(), Some(&itself[..]), "moved by {shift:?}");
+        }
+    }
 }
