@@ -3,6 +3,8 @@
 use super::{Detection, ImageDetections, Source};
 use crate::geometry::Quad;
 use nalgebra::Vector2;
+use rstar::RTree;
+use rstar::primitives::GeomWithData;
 use serde::{Deserialize, Serialize};
 use std::collections::HashSet;
 use std::fs::File;
@@ -82,8 +84,8 @@ pub struct BoxesRead {
     pub left_out: Vec<(String, usize)>,
 }
 
-/// Reads a file of boxes. Those that lie outside of their image and those without area are left out, unless there are no
-/// others: then the file as a whole is not what it should be.
+/// Reads a file of boxes. Those that lie outside of their image, those without area and those that lie on better ones are
+/// left out, unless there are no others: then the file as a whole is not what it should be.
 ///
 /// # Errors
 /// A file that is not of this form, or holds boxes none of which can be used.
@@ -117,6 +119,7 @@ pub fn read(path: &Path) -> Result<BoxesRead, BoxError> {
                 Err(fault) => first_fault = first_fault.or(Some(fault)),
             }
         }
+        let detections = without_doubles(detections);
         let unusable = image.boxes.len() - detections.len();
         if unusable > 0 {
             left_out.push((image.image.clone(), unusable));
@@ -127,6 +130,31 @@ pub fn read(path: &Path) -> Result<BoxesRead, BoxError> {
         Some(fault) if images.iter().all(|image| image.detections.is_empty()) => Err(fault),
         _ => Ok(BoxesRead { images, left_out }),
     }
+}
+
+/// Those that do not lie on a better one: of two of like size, neither has its centre in the other. Lattices need one box to
+/// a module, and heaps of boxes would cost without end.
+fn without_doubles(detections: Vec<Detection>) -> Vec<Detection> {
+    /// Areas within this factor are of like size; how far off a double's centre is at most, in roots of the area.
+    const LIKE: f64 = 3.0;
+    const NEAR: f64 = 2.5;
+    let mut order: Vec<usize> = (0..detections.len()).collect();
+    order.sort_by(|a, b| detections[*b].score.total_cmp(&detections[*a].score).then(a.cmp(b)));
+    let mut better: RTree<GeomWithData<[f64; 2], usize>> = RTree::new();
+    let mut kept = vec![false; detections.len()];
+    for index in order {
+        let (own, center) = (&detections[index].quad, detections[index].quad.center());
+        let is_double = better.locate_within_distance([center.x, center.y], NEAR * NEAR * own.area_px2()).any(|near| {
+            let other = &detections[near.data].quad;
+            (1.0 / LIKE..LIKE).contains(&(own.area_px2() / other.area_px2()))
+                && (other.contains(center) || own.contains(other.center()))
+        });
+        if !is_double {
+            kept[index] = true;
+            better.insert(GeomWithData::new([center.x, center.y], index));
+        }
+    }
+    detections.into_iter().zip(kept).filter(|(_, kept)| *kept).map(|(detection, _)| detection).collect()
 }
 
 /// The module that a box tells of.
@@ -188,6 +216,17 @@ mod tests {
 
     fn file_of(corners: &Value) -> String {
         json!({"images": [{"image": "a.jpg", "width": 100, "height": 80, "boxes": [{"corners": corners}]}]}).to_string()
+    }
+
+    #[test]
+    fn boxes_on_better_ones_are_left_out() {
+        let at = |x: f64, side: f64, score: f64| json!({"corners": [[x, 20.0], [x + side, 20.0], [x + side, 20.0 + side], [x, 20.0 + side]], "score": score});
+        // A module, the same again, its neighbour, and something far larger around all of them.
+        let boxes = [at(10.0, 12.0, 0.8), at(11.0, 12.0, 0.9), at(23.5, 12.0, 0.7), at(2.0, 50.0, 1.0)];
+        let image = json!({"image": "a.jpg", "width": 100, "height": 80, "boxes": boxes});
+        let found = read_file(&json!({"images": [image]}).to_string()).unwrap();
+        let scores: Vec<f32> = found.images[0].detections.iter().map(|detection| detection.score).collect();
+        assert_eq!((scores, found.left_out), (vec![0.9, 0.7, 1.0], vec![("a.jpg".to_owned(), 1)]));
     }
 
     #[test]

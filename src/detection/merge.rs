@@ -13,8 +13,8 @@ const APART: f64 = 0.6;
 const CONTINUED: usize = 3;
 
 /// The boxes of the foundation, and those of the complement that find something else and of which the foundation's network
-/// `shows` at least a trace. Complements take the shape of the neighbour whose lattice they continue. Where there is no
-/// foundation, the complement's own representative box sets the size.
+/// `shows` at least a trace. Complements take the shape of the neighbour whose lattice they continue. Where the foundation
+/// has no box, the complement's own representative box sets the size.
 pub fn merge(
     foundation: Vec<ModuleBox>,
     complement: Vec<ModuleBox>,
@@ -34,7 +34,7 @@ pub fn merge(
                     && quad.overlap_px2(&other.quad()) < OVERLAP * b.area_px2().min(other.area_px2())
             })
     };
-    let added: Vec<ModuleBox> = complement.into_iter().filter(|b| is_new(b) && (found_alone || shows(b))).collect();
+    let added: Vec<ModuleBox> = complement.into_iter().filter(|b| is_new(b) && shows(b)).collect();
     let count = foundation.len();
     let mut all: Vec<ModuleBox> = foundation.into_iter().chain(added).collect();
     if found_alone {
@@ -90,7 +90,9 @@ mod tests {
     #[test]
     fn either_alone_stands() {
         let complement = [at(20.0, 1.0, Source::Yolo), at(40.5, 1.0, Source::Yolo)];
-        assert_eq!(merge(Vec::new(), complement.to_vec(), |_| false).len(), 2);
+        assert_eq!(merge(Vec::new(), complement.to_vec(), |_| true).len(), 2);
+        // A network that sees no trace of them speaks against them, whether or not it has boxes of its own.
+        assert!(merge(Vec::new(), complement.to_vec(), |_| false).is_empty());
         assert_eq!(merge(complement.to_vec(), Vec::new(), |_| true).len(), 2);
         assert!(merge(Vec::new(), Vec::new(), |_| true).is_empty());
     }

@@ -193,6 +193,7 @@ pub(super) fn from_boxes(
     clock: &mut Clock<'_>,
     warnings: &mut Vec<Warning>,
 ) -> Result<Vec<Seen>, MapError> {
+    let observer = clock.observer;
     let read = clock.stage(Stage::Detect, || external::read(path))??;
     let by_name: HashMap<&str, usize> =
         project.reconstruction.shots.iter().enumerate().map(|(index, shot)| (shot.name.as_str(), index)).collect();
@@ -236,7 +237,7 @@ pub(super) fn from_boxes(
         warnings.push(Warning::new(
             "boxes_unusable",
             format!(
-                "{} boxes in {} images lie outside of their image or have no area, and are left out",
+                "{} boxes in {} images lie outside of their image, have no area or lie on better ones, and are left out",
                 counts.iter().sum::<usize>(),
                 images.len()
             ),
@@ -273,6 +274,9 @@ pub(super) fn from_boxes(
     clock.stage(Stage::Layout, || {
         seen.into_par_iter()
             .map(|(shot, detections)| {
+                if observer.cancelled() {
+                    return Err(MapError::Cancelled);
+                }
                 let grey = project.photos[shot].load().map(|image| image::imageops::grayscale(&image));
                 let grey = grey.map_err(ReadError::Photo)?;
                 let layout = layout::infer(&detections, Some(&grey), &LayoutOptions::default());
@@ -305,6 +309,19 @@ pub(super) fn modules_in(seen: &[Seen], warnings: &mut Vec<Warning>) -> Result<u
             "image_without_modules",
             format!("no benches were found in {} of {} images", empty.len(), seen.len()),
             empty,
+        ));
+    }
+    let loose: usize = seen.iter().map(|s| s.layout.loose.len()).sum();
+    // Here and there a false box is no news.
+    if loose >= 3 && 500 * loose > found {
+        let images = seen.iter().filter(|s| !s.layout.loose.is_empty()).map(|s| s.detections.image.clone());
+        warnings.push(Warning::new(
+            "boxes_alone",
+            format!(
+                "{loose} of {found} boxes stand in no bench and are left out: false ones, modules that stand alone, or \
+                 benches of which too little was found"
+            ),
+            images,
         ));
     }
     Ok(found)
