@@ -116,6 +116,7 @@ pub fn map_folder(
             ),
         });
     }
+    warnings.extend(options.rows_contradicted(&fused));
     let refinement_options = RefinementOptions {
         method: options.refinement,
         spacing_m: options.spacing_m,
@@ -132,6 +133,7 @@ pub fn map_folder(
         }
         Ok(refined)
     })??;
+    warnings.extend(options.scale_contradicted(&refined)?);
     let identity = Identity {
         plant: subject.plant,
         plant_name: &subject.plant_name,

@@ -1,8 +1,10 @@
 //! What a mapping may be told, and what it takes where it is told nothing.
 
 use super::MapError;
+use crate::fusion::Fused;
+use crate::plant::Warning;
 use crate::reconstruction;
-use crate::refinement::{self, Control};
+use crate::refinement::{self, Control, Refined, Scaled};
 use serde::{Deserialize, Serialize};
 
 /// What a mapping may be told.
@@ -80,6 +82,55 @@ impl MapOptions {
             control.check()?;
         }
         Ok(())
+    }
+
+    /// Benches that have another number of rows than all are said to have.
+    pub(super) fn rows_contradicted(&self, fused: &Fused) -> Option<Warning> {
+        let rows = self.rows_per_bench?;
+        let others: Vec<i32> =
+            fused.benches.iter().map(|bench| bench.rows).filter(|found| *found != rows as i32).collect();
+        let (least, most) = (others.iter().min()?, others.iter().max()?);
+        let found = if least == most { format!("{most}") } else { format!("{least} to {most}") };
+        let message = format!(
+            "all benches are said to have {rows} rows, but {} of {} were found with {found}: they are as they were found; \
+             check rows_per_bench, and these benches on the map",
+            others.len(),
+            fused.benches.len()
+        );
+        Some(Warning::new("rows_contradicted", message, []))
+    }
+
+    /// Known lengths against measured ones: a warning where the scale changed by more than GNSS errs.
+    ///
+    /// # Errors
+    /// Lengths that no scale makes true: their ratio is another one.
+    pub(super) fn scale_contradicted(&self, refined: &Refined) -> Result<Option<Warning>, MapError> {
+        const MOST_ASPECT: f64 = 0.06;
+        const MOST_SCALE: f64 = 0.1;
+        let Some(Scaled { by, aspect }) = refined.scaled else { return Ok(None) };
+        let (name, [along_m, across_m]) = match (self.spacing_m, self.module_size_m) {
+            (Some(spacing_m), _) => ("spacing_m", spacing_m),
+            (None, Some(size_m)) => ("module_size_m", size_m),
+            (None, None) => return Ok(None),
+        };
+        if (aspect - 1.0).abs() > MOST_ASPECT {
+            return Err(MapError::Input {
+                code: "scale_contradicted",
+                message: format!(
+                    "{name} {along_m} x {across_m} m cannot be: along the row modules measure {:.2} times what they measure \
+                     across it, and not {:.2} times; give the length along the row first, then the one across it",
+                    along_m / across_m / aspect,
+                    along_m / across_m
+                ),
+            });
+        }
+        Ok(((by - 1.0).abs() > MOST_SCALE).then(|| {
+            let message = format!(
+                "{name} {along_m} x {across_m} m makes the plant {by:.3} times as large as the reconstruction has it, where \
+                 GNSS errs by a percent or two: check the lengths"
+            );
+            Warning::new("scale_changed", message, [])
+        }))
     }
 
     /// What heights refer to: as the user says, else as the control does, else what is known of drones.

@@ -47,7 +47,8 @@ pub(super) fn refine(views: &[View<'_>], benches: &[FusedBench]) -> Refined {
         .zip(problem.lattices.par_iter().zip(&uncertainties))
         .map(|(bench, (lattice, uncertainty))| refined(views, &problem.views, bench, lattice, uncertainty))
         .collect();
-    Refined { benches, poses: problem.views.iter().map(AdjustedView::pose).collect(), alignment: None }
+    let poses = problem.views.iter().map(AdjustedView::pose).collect();
+    Refined { benches, poses, alignment: None, scaled: None }
 }
 
 /// What is estimated, and from what.

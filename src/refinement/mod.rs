@@ -14,6 +14,7 @@ use crate::fusion::{Fused, View};
 use crate::geometry::{Pose, Similarity};
 pub use alignment::{Alignment, Control, ControlError};
 use nalgebra::{Rotation3, Vector3};
+pub use scale::Scaled;
 use serde::{Deserialize, Serialize};
 
 /// How positions are refined.
@@ -76,6 +77,8 @@ pub struct Refined {
     pub poses: Vec<Pose>,
     /// How all was brought onto known places, if it was.
     pub alignment: Option<Alignment>,
+    /// How known lengths scaled all, if they did.
+    pub scaled: Option<Scaled>,
 }
 
 impl Refined {
@@ -119,15 +122,16 @@ pub fn refine(views: &[View<'_>], fused: &Fused, options: &RefinementOptions) ->
             benches: paper::refine(views, &fused.benches, options.seed),
             poses: views.iter().map(|view| view.shot.pose).collect(),
             alignment: None,
+            scaled: None,
         },
     };
-    let scale = match (options.spacing_m, options.module_size_m) {
+    refined.scaled = match (options.spacing_m, options.module_size_m) {
         (Some(spacing_m), _) => scale::by_spacing(fused, &refined, spacing_m),
         (None, Some(size_m)) => scale::by_module_size(fused, &refined, size_m),
         (None, None) => None,
     };
-    if let Some(scale) = scale {
-        refined.scale(scale);
+    if let Some(scaled) = refined.scaled {
+        refined.scale(scaled.by);
     }
     refined
 }
