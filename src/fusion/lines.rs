@@ -93,6 +93,9 @@ pub(super) fn arrange(benches: Vec<FusedBench>, doubts: &mut Vec<OpenDoubt>) -> 
             previous[j] = Some(i);
         }
     }
+    let touching = |(i, next): (usize, &Option<usize>)| next.map(|j| (i, j));
+    let joined: Vec<(usize, usize)> = next.iter().enumerate().filter_map(touching).collect();
+    doubts.extend(joined.into_iter().filter_map(|(i, j)| bench_or_hole(&benches[i], &benches[j])));
     doubtful.sort_unstable();
     doubts.extend(
         doubtful
@@ -162,4 +165,45 @@ fn line_unsure(west: &FusedBench, east: &FusedBench) -> OpenDoubt {
         places_m: vec![from, to],
     };
     OpenDoubt { doubt, clusters: vec![west.cluster, east.cluster] }
+}
+
+/// Two benches that one lattice fits, with empty columns between them: they may be one bench whose modules are missing
+/// there.
+fn bench_or_hole(west: &FusedBench, east: &FusedBench) -> Option<OpenDoubt> {
+    /// Most empty columns, and how far off the lattice of the one the other may stand, columns and rows.
+    const MOST_EMPTY: f64 = 4.0;
+    const ON_LATTICE: f64 = 0.06;
+    if west.rows != east.rows {
+        return None;
+    }
+    // The lattice origin of the eastern bench in columns and rows of the western one.
+    let corner = |bench: &FusedBench| {
+        let count = bench.modules.len() as f64;
+        let mean = bench.modules.iter().map(|m| Vector2::new(f64::from(m.col), f64::from(m.row))).sum::<Vector2<f64>>()
+            / count;
+        bench.middle_m.xy() - bench.pitch_m[0] * mean.x - bench.pitch_m[1] * mean.y
+    };
+    let [u, v] = west.pitch_m;
+    let area = u.perp(&v);
+    let offset = corner(east) - corner(west);
+    let (column, row) = (offset.perp(&v) / area, u.perp(&offset) / area);
+    let empty = column - f64::from(west.cols);
+    let whole = empty.round();
+    let on_lattice = (empty - whole).abs() < ON_LATTICE && row.abs() < ON_LATTICE;
+    (on_lattice && (1.0..=MOST_EMPTY).contains(&whole)).then(|| {
+        let middles = [west.middle_m.xy(), east.middle_m.xy()];
+        let doubt = Doubt {
+            code: "bench_or_hole",
+            message: format!(
+                "the benches at {:.1} m east, {:.1} m north and {:.1} m east, {:.1} m north stand on one lattice with \
+                 {whole} empty columns between them: they are taken as two benches, but may be one whose modules are \
+                 missing there",
+                middles[0].x, middles[0].y, middles[1].x, middles[1].y
+            ),
+            images: Vec::new(),
+            benches: Vec::new(),
+            places_m: middles.to_vec(),
+        };
+        OpenDoubt { doubt, clusters: vec![west.cluster, east.cluster] }
+    })
 }

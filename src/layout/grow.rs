@@ -8,7 +8,7 @@ use crate::detection::ImageDetections;
 use crate::geometry::Quad;
 use image::GrayImage;
 use nalgebra::Vector2;
-use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 
 /// A module's neighbours stand 0.75 to this many of its own sides away; what is further is no neighbour.
 const REACH: f64 = 1.45;
@@ -287,6 +287,19 @@ fn components(nodes: &[Node], links: &[[Link; 4]]) -> Vec<Component> {
     found
 }
 
+/// Two linked modules: by how much more than usual they stand apart, in parts of the shorter side.
+#[derive(Clone, Copy)]
+struct Crossing {
+    nodes: (usize, usize),
+    by_pitch: f64,
+    by_sides: f64,
+}
+
+/// How much wider than the narrowest gap must be what keeps two parts of one lattice apart.
+const SURE_GAP: f64 = 1.2;
+/// From so many pairs on, the sides of their boxes tell how far apart they stand: the sides of one box err more than its centre.
+const MANY_CROSSINGS: usize = 4;
+
 /// Removes the links over bench gaps. The distance of neighbours is compared with a smooth model of the pitch in this
 /// component; all rows that cross between the same two columns decide together.
 fn cut_gaps(
@@ -299,37 +312,46 @@ fn cut_gaps(
 ) {
     let sides = component.sides(nodes);
     let scale = sides[0].norm().min(sides[1].norm());
-    // For each axis: (transition, position across it) -> the two nodes and by how much they stand too far apart.
+    // For each axis: (transition, position across it) -> the two nodes and by how much they stand too far apart, by the
+    // pitch of the component and by their own sides.
     let crossings = [0, 1].map(|axis| {
-        let mut found: BTreeMap<(i32, i32), (usize, usize, f64)> = BTreeMap::new();
+        let mut found: BTreeMap<(i32, i32), Crossing> = BTreeMap::new();
         for (&(col, row), &i) in &component.places {
             let next = if axis == 0 { (col + 1, row) } else { (col, row + 1) };
             if let Some(&j) = component.places.get(&next) {
                 let own = (axis + component.turns[&i]) % 4;
                 if matches!(links[i][own], Some((k, _)) if k == j) {
-                    found.insert(if axis == 0 { (col, row) } else { (row, col) }, (i, j, 0.0));
+                    let theirs = (axis + component.turns[&j]) % 4;
+                    let apart = (nodes[j].center - nodes[i].center).norm();
+                    let half = (nodes[i].direction(own).norm() + nodes[j].direction(theirs).norm()) / 2.0;
+                    let crossing = Crossing { nodes: (i, j), by_pitch: 0.0, by_sides: (apart - half) / scale };
+                    found.insert(if axis == 0 { (col, row) } else { (row, col) }, crossing);
                 }
             }
         }
         let lengths: Vec<(Vector2<f64>, f64)> = found
             .values()
-            .map(|&(i, j, _)| ((nodes[i].center + nodes[j].center) / 2.0, (nodes[j].center - nodes[i].center).norm()))
+            .map(|crossing| crossing.nodes)
+            .map(|(i, j)| ((nodes[i].center + nodes[j].center) / 2.0, (nodes[j].center - nodes[i].center).norm()))
             .collect();
         if !lengths.is_empty() {
             let expected = pitch_model(&lengths, sides[axis].norm());
+            let seam = median(&mut found.values().map(|crossing| crossing.by_sides).collect::<Vec<_>>());
             for ((crossing, (_, length)), pitch) in found.values_mut().zip(&lengths).zip(expected) {
-                crossing.2 = (length - pitch) / scale;
+                crossing.by_pitch = (length - pitch) / scale;
+                crossing.by_sides -= seam;
             }
         }
         found
     });
     for axis in 0..2 {
         let keys: Vec<(i32, i32)> = crossings[axis].keys().copied().collect();
-        let links_here: Vec<(usize, usize, f64)> = crossings[axis].values().copied().collect();
+        let links_here: Vec<Crossing> = crossings[axis].values().copied().collect();
         // Two crossings belong together if their modules are neighbours without an aisle between them.
         let together = |first: usize, second: usize| {
             let (from, to) = (keys[first], keys[second]);
-            let tight = |at: i32| crossings[1 - axis].get(&(from.1, at)).is_some_and(|c| c.2 <= options.gap_threshold);
+            let tight =
+                |at: i32| crossings[1 - axis].get(&(from.1, at)).is_some_and(|c| c.by_pitch <= options.gap_threshold);
             to.0 == from.0 && to.1 == from.1 + 1 && (tight(from.0) || tight(from.0 + 1))
         };
         let mut start = 0;
@@ -339,20 +361,24 @@ fn cut_gaps(
                 end += 1;
             }
             let group = &links_here[start..end];
-            let wide = median(&mut group.iter().map(|link| link.2).collect::<Vec<_>>());
+            let wide = median(&mut group.iter().map(|link| link.by_pitch).collect::<Vec<_>>());
             let mut gap = wide > options.gap_threshold;
+            if group.len() >= MANY_CROSSINGS {
+                // Where tables lean away from each other no pitch is common to both; their modules' own sides tell.
+                gap |= median(&mut group.iter().map(|link| link.by_sides).collect::<Vec<_>>()) > options.gap_threshold;
+            }
             if let Some(grey) = grey.filter(|_| !gap && wide > 0.5 * options.gap_threshold) {
                 // Between a seam and a gap by its width: the ground decides (histograms of the transitions, Fig. 8).
-                let quads = |link: &(usize, usize, f64)| {
-                    (detections.detections[link.0].quad, detections.detections[link.1].quad)
+                let quads = |link: &Crossing| {
+                    (detections.detections[link.nodes.0].quad, detections.detections[link.nodes.1].quad)
                 };
                 let usual: Vec<(Quad, Quad)> =
-                    links_here.iter().filter(|link| link.2.abs() < 0.03).take(40).map(quads).collect();
+                    links_here.iter().filter(|link| link.by_pitch.abs() < 0.03).take(40).map(quads).collect();
                 let here: Vec<(Quad, Quad)> = group.iter().map(quads).collect();
                 gap = transition::is_gap(grey, &here, &usual);
             }
             if gap {
-                for &(i, j, _) in group {
+                for (i, j) in group.iter().map(|link| link.nodes) {
                     for (from, to) in [(i, j), (j, i)] {
                         for link in &mut links[from] {
                             if matches!(link, Some((k, _)) if *k == to) {
@@ -570,7 +596,68 @@ fn attachment(
     if !rows_shared && (part_low < col_low - 1 || part_high > col_high + 1) {
         return None;
     }
+    // What stands a gap apart is another bench, whatever the lattice as a whole allows.
+    let placed: BTreeMap<(i32, i32), usize> = places.into_iter().zip(part.places.values().copied()).collect();
+    let shorter = base_sides[0].norm().min(base_sides[1].norm());
+    for (axis, ends) in [
+        (0, facing_ends((col_low, col_high), (part_low, part_high))),
+        (1, facing_ends((row_low, row_high), (part_row_low, part_row_high))),
+    ] {
+        // The pitch in between is neither of both where tables lean away from each other.
+        let leaning = (1.0 + directions[(turn + axis) % 4].norm() / base_sides[axis].norm()) / 2.0;
+        let excess = ends.and_then(|ends| excess(base, &placed, map, nodes, (axis, leaning), ends));
+        if excess
+            .is_some_and(|excess| excess.abs() > SURE_GAP * options.gap_threshold * shorter / base_sides[axis].norm())
+        {
+            return None;
+        }
+    }
     Some(Attachment { shift, turn, missing, bridge })
+}
+
+/// The ends at which two ranges face each other, that of the first one first; `None` where they overlap.
+fn facing_ends(base: (i32, i32), part: (i32, i32)) -> Option<(i32, i32)> {
+    if part.0 > base.1 {
+        Some((base.1, part.0))
+    } else if part.1 < base.0 {
+        Some((base.0, part.1))
+    } else {
+        None
+    }
+}
+
+/// By how much more than whole columns (axis 0) or rows (axis 1) the modules at facing ends stand apart, in pitches there:
+/// the median over the last two of both sides. The pitch in between is that of the base times `leaning`. `None` where few
+/// pairs face each other, for one alone errs by as much as a narrow gap.
+fn excess(
+    base: &Component,
+    placed: &BTreeMap<(i32, i32), usize>,
+    map: &LatticeMap,
+    nodes: &[Node],
+    (axis, leaning): (usize, f64),
+    (end, start): (i32, i32),
+) -> Option<f64> {
+    let outwards = (start - end).signum();
+    let mut found: Vec<f64> = Vec::new();
+    let mut facing = BTreeSet::new();
+    for (place, node) in placed {
+        let (at, aside) = if axis == 0 { *place } else { (place.1, place.0) };
+        if (at - start) * outwards > 1 {
+            continue;
+        }
+        for inwards in 0..2 {
+            let own = end - outwards * inwards;
+            let key = if axis == 0 { (own, aside) } else { (aside, own) };
+            let Some(other) = base.places.get(&key) else { continue };
+            let pitch = map.pitch(f64::from(key.0), f64::from(key.1))[axis] * leaning;
+            let apart = (nodes[*node].center - nodes[*other].center).dot(&pitch) / pitch.norm_squared();
+            found.push((apart - f64::from(at - own)) * f64::from(outwards));
+            facing.insert(aside);
+        }
+    }
+    // Rows are few, and those of one bench in line; columns are many.
+    let least = if axis == 0 { 2 } else { MANY_CROSSINGS };
+    (facing.len() >= least).then(|| median(&mut found))
 }
 
 /// Whether missing columns are missed modules rather than a gap that happens to be a whole number of modules wide. With

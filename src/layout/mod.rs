@@ -233,6 +233,26 @@ mod tests {
     }
 
     #[test]
+    fn tables_one_above_the_other_are_two_pieces() {
+        // Between their rows there are 6 pixels more than a seam.
+        let tables = [table(300.0, 300.0, 2, 12), table(300.0, 300.0 + 77.0 + 6.0, 2, 12)];
+        let layout = infer(&image(&tables, 0.0, 0.0), None, &LayoutOptions::default());
+        assert_eq!(shapes(&layout), [(2, 12), (2, 12)]);
+    }
+
+    #[test]
+    fn tables_that_lean_away_from_each_other_are_two_pieces() {
+        // As at the ridge of a roof seen from one side: the far rows are shorter, and 5 pixels lie between.
+        let mut both = image(&[table(300.0, 300.0, 2, 12)], 0.0, 0.0);
+        let top = 300.0 + 38.5 + 19.0;
+        let far = image(&[table(300.0, top + 5.0 + 19.0, 2, 12)], 0.0, 0.0).detections;
+        let shorten = |p: Vector2<f64>| Vector2::new(p.x, top + 5.0 + 0.88 * (p.y - top - 5.0));
+        both.detections.extend(far.into_iter().map(|d| Detection { quad: d.quad.map(shorten), ..d }));
+        let layout = infer(&both, None, &LayoutOptions::default());
+        assert_eq!(shapes(&layout), [(2, 12), (2, 12)]);
+    }
+
+    #[test]
     fn nothing_gives_nothing() {
         let layout = infer(&image(&[], 0.0, 0.0), None, &LayoutOptions::default());
         assert!(layout.pieces.is_empty() && layout.gaps.is_empty() && layout.loose.is_empty());

@@ -107,3 +107,37 @@ fn boxes_of_other_images_are_left_out_with_a_warning() {
     });
     survey.maps_with_warnings(true, &[("boxes_without_shot", &["DJI_0008.jpg"])]);
 }
+
+#[test]
+fn what_is_said_of_a_plant_is_compared_with_what_is_found() {
+    let survey = Survey::new();
+    // Swapped: no scale makes that true.
+    survey.is_refused(&["--spacing", "1.67,1.02"], &["spacing_m", "along the row first"]);
+    survey.is_refused(&["--module-size", "2,1"], &["module_size_m", "along the row first"]);
+    for (options, code) in
+        [(["--spacing", "5.1,8.35"], "scale_changed"), (["--rows-per-bench", "3"], "rows_contradicted")]
+    {
+        let said = survey.map(true, &options);
+        assert_eq!(said.code, Some(0), "{}", said.stderr);
+        assert!(said.stdout.contains(code), "{}", said.stdout);
+        assert_eq!(survey.modules().len(), 434);
+    }
+}
+
+#[test]
+fn an_empty_column_is_a_hole_or_a_gap_and_that_is_asked() {
+    let survey = Survey::new();
+    survey.write_boxes(|module| module["bench"] != 4 || module["col"] != 7);
+    let said = survey.map(true, &[]);
+    assert_eq!(said.code, Some(0), "{}", said.stderr);
+    assert!(said.stdout.contains("bench_or_hole"), "{}", said.stdout);
+}
+
+#[test]
+fn modules_that_stand_alone_are_told() {
+    let survey = Survey::new();
+    survey.write_boxes(|module| module["bench"] != 4 || (module["row"] == 0 && module["col"] == 0));
+    let said = survey.map(true, &[]);
+    assert_eq!(said.code, Some(0), "{}", said.stderr);
+    assert!(said.stdout.contains("boxes_alone"), "{}", said.stdout);
+}
