@@ -135,7 +135,8 @@ impl Warning {
 }
 
 /// A whole plant. All vectors are sorted: lines from the north, benches from the west, rows from the north, modules by
-/// number, so that equal input gives equal bytes.
+/// number (where rows run north-south: lines and rows from the east, benches from the north), so that equal input gives
+/// equal bytes.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PlantModel {
     pub plant: PlantId,
