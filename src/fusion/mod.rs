@@ -1,6 +1,7 @@
 //! The layouts of all images become one plant: pixels to 3D, pieces of benches matched between images, their structures
 //! merged, mended and confirmed (paper, 3.4 and 3.5).
 
+mod apart;
 pub mod associate;
 pub mod benches;
 mod cluster;

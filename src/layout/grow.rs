@@ -1,14 +1,15 @@
 //! Benches grow from module to module: links between neighbours, cuts where a gap lies between them, lattice
 //! coordinates along the links, and hypotheses where a module is missing.
 
+use super::cut::cut_gaps;
+use super::join::join;
 use super::lattice::{LatticeMap, Sample};
-use super::transition;
 use super::{Cell, End, LayoutOptions, Piece};
 use crate::detection::ImageDetections;
 use crate::geometry::Quad;
 use image::GrayImage;
 use nalgebra::Vector2;
-use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
+use std::collections::{BTreeMap, HashMap, VecDeque};
 
 /// A module's neighbours stand 0.75 to this many of its own sides away; what is further is no neighbour.
 const REACH: f64 = 1.45;
@@ -19,32 +20,32 @@ const LONG: i32 = 12;
 
 /// A detection as the growth sees it: its centre, and the side vectors of its box, `b` a quarter turn clockwise from `a`.
 #[derive(Clone, Copy)]
-struct Node {
-    center: Vector2<f64>,
-    sides: [Vector2<f64>; 2],
+pub(super) struct Node {
+    pub(super) center: Vector2<f64>,
+    pub(super) sides: [Vector2<f64>; 2],
 }
 
 impl Node {
     /// Side vector of one of the four directions: a, b, -a, -b.
-    fn direction(&self, d: usize) -> Vector2<f64> {
+    pub(super) fn direction(&self, d: usize) -> Vector2<f64> {
         if d % 4 < 2 { self.sides[d % 2] } else { -self.sides[d % 2] }
     }
 }
 
 /// A link to a neighbour: which, and by how many quarter turns its own frame is turned against ours.
-type Link = Option<(usize, usize)>;
+pub(super) type Link = Option<(usize, usize)>;
 
 /// A connected set of modules with lattice coordinates.
-struct Component {
+pub(super) struct Component {
     /// (column, row) of each node.
-    places: BTreeMap<(i32, i32), usize>,
+    pub(super) places: BTreeMap<(i32, i32), usize>,
     /// Quarter turns of each node's frame against the component's.
-    turns: HashMap<usize, usize>,
-    bridges: Vec<i32>,
+    pub(super) turns: HashMap<usize, usize>,
+    pub(super) bridges: Vec<i32>,
 }
 
 impl Component {
-    fn sides(&self, nodes: &[Node]) -> [Vector2<f64>; 2] {
+    pub(super) fn sides(&self, nodes: &[Node]) -> [Vector2<f64>; 2] {
         [0, 1].map(|d| {
             let mut x: Vec<f64> = Vec::with_capacity(self.places.len());
             let mut y: Vec<f64> = Vec::with_capacity(self.places.len());
@@ -57,7 +58,7 @@ impl Component {
         })
     }
 
-    fn map(&self, nodes: &[Node]) -> LatticeMap {
+    pub(super) fn map(&self, nodes: &[Node]) -> LatticeMap {
         let samples: Vec<Sample> = self
             .places
             .iter()
@@ -67,20 +68,20 @@ impl Component {
         LatticeMap::fit(&samples, u * 1.02, v * 1.02)
     }
 
-    fn col_range(&self) -> (i32, i32) {
+    pub(super) fn col_range(&self) -> (i32, i32) {
         range(self.places.keys().map(|place| place.0))
     }
 
-    fn row_range(&self) -> (i32, i32) {
+    pub(super) fn row_range(&self) -> (i32, i32) {
         range(self.places.keys().map(|place| place.1))
     }
 }
 
-fn range(values: impl Iterator<Item = i32>) -> (i32, i32) {
+pub(super) fn range(values: impl Iterator<Item = i32>) -> (i32, i32) {
     values.fold((i32::MAX, i32::MIN), |(low, high), v| (low.min(v), high.max(v)))
 }
 
-fn median(values: &mut [f64]) -> f64 {
+pub(super) fn median(values: &mut [f64]) -> f64 {
     let middle = values.len() / 2;
     *values.select_nth_unstable_by(middle, f64::total_cmp).1
 }
@@ -287,153 +288,6 @@ fn components(nodes: &[Node], links: &[[Link; 4]]) -> Vec<Component> {
     found
 }
 
-/// Two linked modules: by how much more than usual they stand apart, in parts of the shorter side.
-#[derive(Clone, Copy)]
-struct Crossing {
-    nodes: (usize, usize),
-    by_pitch: f64,
-    by_sides: f64,
-}
-
-/// How much wider than the narrowest gap must be what keeps two parts of one lattice apart.
-const SURE_GAP: f64 = 1.2;
-/// From so many pairs on, the sides of their boxes tell how far apart they stand: the sides of one box err more than its centre.
-const MANY_CROSSINGS: usize = 4;
-
-/// Removes the links over bench gaps. The distance of neighbours is compared with a smooth model of the pitch in this
-/// component; all rows that cross between the same two columns decide together.
-fn cut_gaps(
-    component: &Component,
-    nodes: &[Node],
-    links: &mut [[Link; 4]],
-    detections: &ImageDetections,
-    grey: Option<&GrayImage>,
-    options: &LayoutOptions,
-) {
-    let sides = component.sides(nodes);
-    let scale = sides[0].norm().min(sides[1].norm());
-    // For each axis: (transition, position across it) -> the two nodes and by how much they stand too far apart, by the
-    // pitch of the component and by their own sides.
-    let crossings = [0, 1].map(|axis| {
-        let mut found: BTreeMap<(i32, i32), Crossing> = BTreeMap::new();
-        for (&(col, row), &i) in &component.places {
-            let next = if axis == 0 { (col + 1, row) } else { (col, row + 1) };
-            if let Some(&j) = component.places.get(&next) {
-                let own = (axis + component.turns[&i]) % 4;
-                if matches!(links[i][own], Some((k, _)) if k == j) {
-                    let theirs = (axis + component.turns[&j]) % 4;
-                    let apart = (nodes[j].center - nodes[i].center).norm();
-                    let half = (nodes[i].direction(own).norm() + nodes[j].direction(theirs).norm()) / 2.0;
-                    let crossing = Crossing { nodes: (i, j), by_pitch: 0.0, by_sides: (apart - half) / scale };
-                    found.insert(if axis == 0 { (col, row) } else { (row, col) }, crossing);
-                }
-            }
-        }
-        let lengths: Vec<(Vector2<f64>, f64)> = found
-            .values()
-            .map(|crossing| crossing.nodes)
-            .map(|(i, j)| ((nodes[i].center + nodes[j].center) / 2.0, (nodes[j].center - nodes[i].center).norm()))
-            .collect();
-        if !lengths.is_empty() {
-            let expected = pitch_model(&lengths, sides[axis].norm());
-            let seam = median(&mut found.values().map(|crossing| crossing.by_sides).collect::<Vec<_>>());
-            for ((crossing, (_, length)), pitch) in found.values_mut().zip(&lengths).zip(expected) {
-                crossing.by_pitch = (length - pitch) / scale;
-                crossing.by_sides -= seam;
-            }
-        }
-        found
-    });
-    for axis in 0..2 {
-        let keys: Vec<(i32, i32)> = crossings[axis].keys().copied().collect();
-        let links_here: Vec<Crossing> = crossings[axis].values().copied().collect();
-        // Two crossings belong together if their modules are neighbours without an aisle between them.
-        let together = |first: usize, second: usize| {
-            let (from, to) = (keys[first], keys[second]);
-            let tight =
-                |at: i32| crossings[1 - axis].get(&(from.1, at)).is_some_and(|c| c.by_pitch <= options.gap_threshold);
-            to.0 == from.0 && to.1 == from.1 + 1 && (tight(from.0) || tight(from.0 + 1))
-        };
-        let mut start = 0;
-        while start < keys.len() {
-            let mut end = start + 1;
-            while end < keys.len() && together(end - 1, end) {
-                end += 1;
-            }
-            let group = &links_here[start..end];
-            let wide = median(&mut group.iter().map(|link| link.by_pitch).collect::<Vec<_>>());
-            let mut gap = wide > options.gap_threshold;
-            if group.len() >= MANY_CROSSINGS {
-                // Where tables lean away from each other no pitch is common to both; their modules' own sides tell.
-                gap |= median(&mut group.iter().map(|link| link.by_sides).collect::<Vec<_>>()) > options.gap_threshold;
-            }
-            if let Some(grey) = grey.filter(|_| !gap && wide > 0.5 * options.gap_threshold) {
-                // Between a seam and a gap by its width: the ground decides (histograms of the transitions, Fig. 8).
-                let quads = |link: &Crossing| {
-                    (detections.detections[link.nodes.0].quad, detections.detections[link.nodes.1].quad)
-                };
-                let usual: Vec<(Quad, Quad)> =
-                    links_here.iter().filter(|link| link.by_pitch.abs() < 0.03).take(40).map(quads).collect();
-                let here: Vec<(Quad, Quad)> = group.iter().map(quads).collect();
-                gap = transition::is_gap(grey, &here, &usual);
-            }
-            if gap {
-                for (i, j) in group.iter().map(|link| link.nodes) {
-                    for (from, to) in [(i, j), (j, i)] {
-                        for link in &mut links[from] {
-                            if matches!(link, Some((k, _)) if *k == to) {
-                                *link = None;
-                            }
-                        }
-                    }
-                }
-            }
-            start = end;
-        }
-    }
-}
-
-/// The expected distance at each link: the logarithm of the length is fitted as an affine function of the position, gaps
-/// left out as outliers. Few links give their lower median, but never less than the module's own side.
-fn pitch_model(lengths: &[(Vector2<f64>, f64)], side_px: f64) -> Vec<f64> {
-    let mut sorted: Vec<f64> = lengths.iter().map(|(_, length)| *length).collect();
-    sorted.sort_by(f64::total_cmp);
-    let lower = sorted[(sorted.len() - 1) * 2 / 5].min(side_px * 1.12).max(side_px * 0.95);
-    if lengths.len() < 8 {
-        return vec![lower; lengths.len()];
-    }
-    let origin = lengths.iter().map(|(at, _)| at).sum::<Vector2<f64>>() / lengths.len() as f64;
-    let spread = lengths.iter().map(|(at, _)| (at - origin).norm()).fold(1.0, f64::max);
-    let mut model = nalgebra::Vector3::new(lower.ln(), 0.0, 0.0);
-    let value = |model: &nalgebra::Vector3<f64>, at: &Vector2<f64>| {
-        let p = (at - origin) / spread;
-        model.x + model.y * p.x + model.z * p.y
-    };
-    let mut cut = 0.08;
-    for _ in 0..6 {
-        let mut normal = nalgebra::Matrix3::from_diagonal_element(1e-6);
-        normal += nalgebra::Matrix3::from_diagonal(&nalgebra::Vector3::new(0.0, 0.05, 0.05));
-        let mut right = nalgebra::Vector3::zeros();
-        for (at, length) in lengths {
-            let t = (length.ln() - value(&model, at)) / cut;
-            if t.abs() >= 1.0 {
-                continue;
-            }
-            let weight = (1.0 - t * t).powi(2);
-            let p = (at - origin) / spread;
-            let row = nalgebra::Vector3::new(1.0, p.x, p.y);
-            normal += weight * row * row.transpose();
-            right += weight * length.ln() * row;
-        }
-        match normal.cholesky() {
-            Some(cholesky) => model = cholesky.solve(&right),
-            None => break,
-        }
-        cut = 0.06;
-    }
-    lengths.iter().map(|(at, _)| value(&model, at).exp()).collect()
-}
-
 /// Takes out modules that stand off the lattice of their component.
 fn drop_outliers(component: &mut Component, nodes: &[Node]) {
     if component.places.len() < 6 {
@@ -453,234 +307,6 @@ fn drop_outliers(component: &mut Component, nodes: &[Node]) {
     for place in out {
         component.places.remove(&place);
     }
-}
-
-/// Joins components that stand in one lattice: what a broken link or missing modules (equation 3) tore apart.
-fn join(
-    grown: &mut Vec<Component>,
-    nodes: &[Node],
-    detections: &ImageDetections,
-    grey: Option<&GrayImage>,
-    options: &LayoutOptions,
-) {
-    grown.sort_by_key(|component| std::cmp::Reverse(component.places.len()));
-    let mut sides: Vec<[Vector2<f64>; 2]> = grown.iter().map(|component| component.sides(nodes)).collect();
-    let mut index = 0;
-    while index < grown.len() {
-        if grown[index].places.len() < 2 {
-            break;
-        }
-        let mut map = grown[index].map(nodes);
-        let mut other = index + 1;
-        while other < grown.len() {
-            let (base, part) = ((&grown[index], sides[index]), (&grown[other], sides[other]));
-            let joined = attachment(base, &map, part, nodes, options).filter(|join| {
-                join.missing == 0 || bridge_is_sound(join, &grown[index], &map, grey, detections, nodes)
-            });
-            let Some(attach) = joined else {
-                other += 1;
-                continue;
-            };
-            let part = grown.remove(other);
-            sides.remove(other);
-            let base = &mut grown[index];
-            for ((col, row), node) in &part.places {
-                let (u, v) = turned(*col, *row, attach.turn);
-                base.places.insert((u + attach.shift.0, v + attach.shift.1), *node);
-                base.turns.insert(*node, (part.turns[node] + attach.turn) % 4);
-            }
-            if attach.missing > 0 {
-                base.bridges.push(attach.bridge);
-            }
-            map = base.map(nodes);
-            sides[index] = base.sides(nodes);
-            // What failed before may fit the longer lattice.
-            other = index + 1;
-        }
-        index += 1;
-    }
-}
-
-/// Lattice coordinates in a frame turned by quarter turns.
-fn turned(col: i32, row: i32, turn: usize) -> (i32, i32) {
-    // A node's direction d is the component's direction d - turn, so a part turned by `turn` steps its own +u along
-    // direction `4 - turn` of the base.
-    match (4 - turn) % 4 {
-        0 => (col, row),
-        1 => (-row, col),
-        2 => (-col, -row),
-        _ => (row, -col),
-    }
-}
-
-struct Attachment {
-    shift: (i32, i32),
-    turn: usize,
-    /// Columns without any detection between the two.
-    missing: i32,
-    /// Column of the base after which they are missing.
-    bridge: i32,
-}
-
-/// How `part` stands in the lattice of `base`, if it does; each with its module's sides.
-fn attachment(
-    (base, base_sides): (&Component, [Vector2<f64>; 2]),
-    map: &LatticeMap,
-    (part, part_sides): (&Component, [Vector2<f64>; 2]),
-    nodes: &[Node],
-    options: &LayoutOptions,
-) -> Option<Attachment> {
-    let directions = [part_sides[0], part_sides[1], -part_sides[0], -part_sides[1]];
-    let turn = (0..4).max_by(|&s, &t| {
-        let cosine = |k: usize| base_sides[0].dot(&directions[k]) / directions[k].norm();
-        cosine(s).total_cmp(&cosine(t))
-    })?;
-    for (mine, theirs) in [(base_sides[0], directions[turn]), (base_sides[1], directions[(turn + 1) % 4])] {
-        if !(0.8..1.25).contains(&(theirs.norm() / mine.norm()))
-            || mine.dot(&theirs) < 0.95 * mine.norm() * theirs.norm()
-        {
-            return None;
-        }
-    }
-    let (col_low, col_high) = base.col_range();
-    let (row_low, row_high) = base.row_range();
-    let reach = f64::from(options.max_missing + 2);
-    // Gaps are as wide as the shorter side tells, however long the modules are along the row.
-    let narrow = (base_sides[0].norm().min(base_sides[1].norm()) / base_sides[0].norm()).min(1.0);
-    let mut shift = None;
-    for ((col, row), node) in &part.places {
-        let at = map.coordinate(nodes[*node].center)?;
-        let outside = (f64::from(col_low) - at.x).max(at.x - f64::from(col_high)).max(0.0);
-        // The lattice is known where it was fitted; beyond it, less and less.
-        let tolerance = 0.15 + 0.02 * outside.min(10.0);
-        let (u, v) = turned(*col, *row, turn);
-        let near = (at.x.round() as i32 - u, at.y.round() as i32 - v);
-        if shift.is_none() && outside > reach {
-            return None;
-        }
-        let shift = *shift.get_or_insert(near);
-        let place = (u + shift.0, v + shift.1);
-        if base.places.contains_key(&place) {
-            return None;
-        }
-        let (off_col, off_row) = (at.x - f64::from(place.0), at.y - f64::from(place.1));
-        if outside < reach && (off_col.abs() > tolerance * narrow || off_row.abs() > 0.25) {
-            return None;
-        }
-    }
-    let shift = shift?;
-    let places: Vec<(i32, i32)> = part
-        .places
-        .keys()
-        .map(|(col, row)| turned(*col, *row, turn))
-        .map(|(u, v)| (u + shift.0, v + shift.1))
-        .collect();
-    let (part_low, part_high) = range(places.iter().map(|place| place.0));
-    let (part_row_low, part_row_high) = range(places.iter().map(|place| place.1));
-    // A whole row further out than the next one is another bench.
-    if part_row_low > row_high + 1 || part_row_high < row_low - 1 {
-        return None;
-    }
-    let rows_shared = part_row_low <= row_high && part_row_high >= row_low;
-    let (missing, bridge) = if part_low > col_high {
-        (part_low - col_high - 1, col_high)
-    } else if part_high < col_low {
-        (col_low - part_high - 1, part_high)
-    } else {
-        (0, 0)
-    };
-    if missing > options.max_missing || (missing > 0 && !rows_shared) {
-        return None;
-    }
-    // Beside each other and not linked: only the same columns say that they are rows of one bench.
-    if !rows_shared && (part_low < col_low - 1 || part_high > col_high + 1) {
-        return None;
-    }
-    // What stands a gap apart is another bench, whatever the lattice as a whole allows.
-    let placed: BTreeMap<(i32, i32), usize> = places.into_iter().zip(part.places.values().copied()).collect();
-    let shorter = base_sides[0].norm().min(base_sides[1].norm());
-    for (axis, ends) in [
-        (0, facing_ends((col_low, col_high), (part_low, part_high))),
-        (1, facing_ends((row_low, row_high), (part_row_low, part_row_high))),
-    ] {
-        // The pitch in between is neither of both where tables lean away from each other.
-        let leaning = (1.0 + directions[(turn + axis) % 4].norm() / base_sides[axis].norm()) / 2.0;
-        let excess = ends.and_then(|ends| excess(base, &placed, map, nodes, (axis, leaning), ends));
-        if excess
-            .is_some_and(|excess| excess.abs() > SURE_GAP * options.gap_threshold * shorter / base_sides[axis].norm())
-        {
-            return None;
-        }
-    }
-    Some(Attachment { shift, turn, missing, bridge })
-}
-
-/// The ends at which two ranges face each other, that of the first one first; `None` where they overlap.
-fn facing_ends(base: (i32, i32), part: (i32, i32)) -> Option<(i32, i32)> {
-    if part.0 > base.1 {
-        Some((base.1, part.0))
-    } else if part.1 < base.0 {
-        Some((base.0, part.1))
-    } else {
-        None
-    }
-}
-
-/// By how much more than whole columns (axis 0) or rows (axis 1) the modules at facing ends stand apart, in pitches there:
-/// the median over the last two of both sides. The pitch in between is that of the base times `leaning`. `None` where few
-/// pairs face each other, for one alone errs by as much as a narrow gap.
-fn excess(
-    base: &Component,
-    placed: &BTreeMap<(i32, i32), usize>,
-    map: &LatticeMap,
-    nodes: &[Node],
-    (axis, leaning): (usize, f64),
-    (end, start): (i32, i32),
-) -> Option<f64> {
-    let outwards = (start - end).signum();
-    let mut found: Vec<f64> = Vec::new();
-    let mut facing = BTreeSet::new();
-    for (place, node) in placed {
-        let (at, aside) = if axis == 0 { *place } else { (place.1, place.0) };
-        if (at - start) * outwards > 1 {
-            continue;
-        }
-        for inwards in 0..2 {
-            let own = end - outwards * inwards;
-            let key = if axis == 0 { (own, aside) } else { (aside, own) };
-            let Some(other) = base.places.get(&key) else { continue };
-            let pitch = map.pitch(f64::from(key.0), f64::from(key.1))[axis] * leaning;
-            let apart = (nodes[*node].center - nodes[*other].center).dot(&pitch) / pitch.norm_squared();
-            found.push((apart - f64::from(at - own)) * f64::from(outwards));
-            facing.insert(aside);
-        }
-    }
-    // Rows are few, and those of one bench in line; columns are many.
-    let least = if axis == 0 { 2 } else { MANY_CROSSINGS };
-    (facing.len() >= least).then(|| median(&mut found))
-}
-
-/// Whether missing columns are missed modules rather than a gap that happens to be a whole number of modules wide. With
-/// an image, the place must look like a module or be washed out by glare; without one, a single row may miss one or two.
-fn bridge_is_sound(
-    attach: &Attachment,
-    base: &Component,
-    map: &LatticeMap,
-    grey: Option<&GrayImage>,
-    detections: &ImageDetections,
-    nodes: &[Node],
-) -> bool {
-    let (row_low, row_high) = base.row_range();
-    let Some(grey) = grey else {
-        return row_low == row_high && attach.missing <= 2;
-    };
-    let [u, v] = base.sides(nodes);
-    let examples: Vec<Quad> = base.places.values().take(40).map(|node| detections.detections[*node].quad).collect();
-    let places: Vec<Quad> = (1..=attach.missing)
-        .flat_map(|k| (row_low..=row_high).map(move |row| (attach.bridge + k, row)))
-        .map(|(col, row)| Quad::from_center(map.pixel(f64::from(col), f64::from(row)), u / 2.0, v / 2.0))
-        .collect();
-    transition::looks_like_modules(grey, &places, &examples)
 }
 
 /// Turns every component so that its columns run along the row: a long one by its own shape, a short one as the long ones

@@ -5,7 +5,9 @@
 //! two side vectors, its neighbours stand one side further, and the links between them span benches of any number of
 //! rows, straight or curved, of any azimuth. See `docs/PIPELINE.md` for the comparison.
 
+mod cut;
 pub mod grow;
+mod join;
 pub mod keypoints;
 pub mod lattice;
 pub mod transition;
