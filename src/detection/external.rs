@@ -84,8 +84,8 @@ pub struct BoxesRead {
     pub left_out: Vec<(String, usize)>,
 }
 
-/// Reads a file of boxes. Those that lie outside of their image, those without area and those that lie on better ones are
-/// left out, unless there are no others: then the file as a whole is not what it should be.
+/// Reads a file of boxes. Those that lie outside of their image and those without area are left out, unless there are no
+/// others: then the file as a whole is not what it should be.
 ///
 /// # Errors
 /// A file that is not of this form, or holds boxes none of which can be used.
@@ -119,7 +119,6 @@ pub fn read(path: &Path) -> Result<BoxesRead, BoxError> {
                 Err(fault) => first_fault = first_fault.or(Some(fault)),
             }
         }
-        let detections = without_doubles(detections);
         let unusable = image.boxes.len() - detections.len();
         if unusable > 0 {
             left_out.push((image.image.clone(), unusable));
@@ -132,9 +131,9 @@ pub fn read(path: &Path) -> Result<BoxesRead, BoxError> {
     }
 }
 
-/// Those that do not lie on a better one: of two of like size, neither has its centre in the other. Lattices need one box to
+/// The boxes of an image that do not lie on a better one: of two of like size, neither has its centre in the other. Lattices need one box to
 /// a module, and heaps of boxes would cost without end.
-fn without_doubles(detections: Vec<Detection>) -> Vec<Detection> {
+pub fn without_doubles(detections: Vec<Detection>) -> Vec<Detection> {
     /// Areas within this factor are of like size; how far off a double's centre is at most, in roots of the area.
     const LIKE: f64 = 3.0;
     const NEAR: f64 = 2.5;
@@ -220,13 +219,16 @@ mod tests {
 
     #[test]
     fn boxes_on_better_ones_are_left_out() {
-        let at = |x: f64, side: f64, score: f64| json!({"corners": [[x, 20.0], [x + side, 20.0], [x + side, 20.0 + side], [x, 20.0 + side]], "score": score});
+        let at = |x: f64, side: f64, score: f64| {
+            let (right, bottom) = (x + side, 20.0 + side);
+            json!({"corners": [[x, 20.0], [right, 20.0], [right, bottom], [x, bottom]], "score": score})
+        };
         // A module, the same again, its neighbour, and something far larger around all of them.
         let boxes = [at(10.0, 12.0, 0.8), at(11.0, 12.0, 0.9), at(23.5, 12.0, 0.7), at(2.0, 50.0, 1.0)];
         let image = json!({"image": "a.jpg", "width": 100, "height": 80, "boxes": boxes});
-        let found = read_file(&json!({"images": [image]}).to_string()).unwrap();
-        let scores: Vec<f32> = found.images[0].detections.iter().map(|detection| detection.score).collect();
-        assert_eq!((scores, found.left_out), (vec![0.9, 0.7, 1.0], vec![("a.jpg".to_owned(), 1)]));
+        let mut read = read_text(&json!({"images": [image]}).to_string()).unwrap();
+        let kept = without_doubles(read.remove(0).detections);
+        assert_eq!(kept.iter().map(|detection| detection.score).collect::<Vec<_>>(), [0.9, 0.7, 1.0]);
     }
 
     #[test]

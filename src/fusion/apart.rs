@@ -23,16 +23,18 @@ pub(super) struct Facing {
     rows: usize,
 }
 
+/// The larger of two pieces and the other one, where both are of one image.
+fn larger_first(a: usize, b: usize, pieces: &[LocatedPiece]) -> Option<(usize, usize)> {
+    let (first, second) = (&pieces[a], &pieces[b]);
+    (first.view == second.view).then_some(if first.cells.len() >= second.cells.len() { (a, b) } else { (b, a) })
+}
+
 /// Whether two pieces are of one image and stand one behind the other.
 pub(super) fn facing(a: usize, b: usize, pieces: &[LocatedPiece]) -> Option<Facing> {
     /// Farther off a lattice is too little known to tell, columns.
     const NEAR: f64 = 3.0;
-    let (first, second) = (&pieces[a], &pieces[b]);
-    if first.view != second.view {
-        return None;
-    }
-    let ((base, base_piece), (part, part_piece)) =
-        if first.cells.len() >= second.cells.len() { ((first, a), (second, b)) } else { ((second, b), (first, a)) };
+    let (base_piece, part_piece) = larger_first(a, b, pieces)?;
+    let (base, part) = (&pieces[base_piece], &pieces[part_piece]);
     let outside = |at: &Vector2<f64>| (-at.x).max(at.x - f64::from(base.cols - 1));
     let (nearest, cell) = part
         .cells
@@ -86,12 +88,8 @@ fn steps_between(first: &LocatedPiece, second: &LocatedPiece, axis: usize, shift
 /// Two pieces of one image, one beside the other, with more than a seam between their rows: tables that face each other, or
 /// stand one above the other.
 pub(super) fn aisle_between(a: usize, b: usize, pieces: &[LocatedPiece]) -> Option<Link> {
-    let (first, second) = (&pieces[a], &pieces[b]);
-    if first.view != second.view {
-        return None;
-    }
-    let ((base, base_piece), (part, part_piece)) =
-        if first.cells.len() >= second.cells.len() { ((first, a), (second, b)) } else { ((second, b), (first, a)) };
+    let (base_piece, part_piece) = larger_first(a, b, pieces)?;
+    let (base, part) = (&pieces[base_piece], &pieces[part_piece]);
     let cell = part.cells.iter().filter(|cell| cell.detection.is_some()).find_map(|cell| {
         let at = base.ground.coordinate(cell.position_m.xy())?;
         let beside = (-0.4..f64::from(base.cols) - 0.6).contains(&at.x);

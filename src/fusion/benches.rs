@@ -315,6 +315,7 @@ pub(super) fn without_ghosts(
             .collect(),
     );
     let mut kept = vec![false; benches.len()];
+    let mut left_out = Vec::new();
     for &index in &order {
         let bench = &benches[index];
         let [u, v] = bench.pitch_m.map(|pitch| pitch.norm());
@@ -370,11 +371,14 @@ pub(super) fn without_ghosts(
                 benches: Vec::new(),
                 places_m: vec![bench.middle_m.xy()],
             };
-            // What was said of places inside of it says nothing of the model.
-            doubts.retain(|said| said.clusters != [bench.cluster]);
-            doubts.push(OpenDoubt { doubt, clusters });
+            left_out.push(OpenDoubt { doubt, clusters });
         }
     }
+    // What was said of places inside of benches that are left out says nothing of the model.
+    let ghosts: BTreeSet<usize> =
+        benches.iter().zip(&kept).filter(|(_, keep)| !**keep).map(|(b, _)| b.cluster).collect();
+    doubts.retain(|said| !matches!(said.clusters[..], [cluster] if ghosts.contains(&cluster)));
+    doubts.extend(left_out);
     benches.into_iter().zip(kept).filter_map(|(bench, keep)| keep.then_some(bench)).collect()
 }
 

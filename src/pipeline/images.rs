@@ -11,7 +11,7 @@ use crate::plant::Warning;
 use crate::reconstruction::{Photo, Project, ReadError, Shot};
 use nalgebra::Vector3;
 use rayon::prelude::*;
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::path::Path;
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -199,7 +199,8 @@ pub(super) fn from_boxes(
         project.reconstruction.shots.iter().enumerate().map(|(index, shot)| (shot.name.as_str(), index)).collect();
     let mut seen: Vec<(usize, ImageDetections)> = Vec::new();
     let mut unknown = Vec::new();
-    for detections in read.images {
+    let mut doubles: Vec<(String, usize)> = Vec::new();
+    for mut detections in read.images {
         let Some(&shot) = by_name.get(detections.image.as_str()) else {
             unknown.push(detections.image);
             continue;
@@ -214,6 +215,11 @@ pub(super) fn from_boxes(
                     detections.image, detections.width_px, detections.height_px, camera.width_px, camera.height_px
                 ),
             });
+        }
+        let given = detections.detections.len();
+        detections.detections = external::without_doubles(detections.detections);
+        if detections.detections.len() < given {
+            doubles.push((detections.image.clone(), given - detections.detections.len()));
         }
         seen.push((shot, detections));
     }
@@ -237,19 +243,28 @@ pub(super) fn from_boxes(
         warnings.push(Warning::new(
             "boxes_unusable",
             format!(
-                "{} boxes in {} images lie outside of their image, have no area or lie on better ones, and are left out",
+                "{} boxes in {} images lie outside of their image or have no area, and are left out",
                 counts.iter().sum::<usize>(),
                 images.len()
             ),
             images,
         ));
     }
+    if !doubles.is_empty() {
+        let (images, counts): (Vec<String>, Vec<usize>) = doubles.into_iter().unzip();
+        let message = format!(
+            "{} boxes in {} images lie on better ones, and are left out: a module has one box",
+            counts.iter().sum::<usize>(),
+            images.len()
+        );
+        warnings.push(Warning::new("boxes_double", message, images));
+    }
     // What those notes say of a search does not hold here.
     let expected = resolving(project, gsd_m, options, &mut Vec::new());
-    let is_given = |shot: &usize| seen.iter().any(|(given, _)| given == shot);
+    let given: HashSet<usize> = seen.iter().map(|(shot, _)| *shot).collect();
     let without: Vec<String> = expected
         .into_iter()
-        .filter(|shot| !is_given(shot))
+        .filter(|shot| !given.contains(shot))
         .map(|shot| project.reconstruction.shots[shot].name.clone())
         .collect();
     if !without.is_empty() {

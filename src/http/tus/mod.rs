@@ -147,9 +147,14 @@ async fn found(state: &AppState, path: &UploadPath, headers: &HeaderMap) -> Resu
     require_upload(state, path.survey, path.upload).await
 }
 
-/// As [`found`], in the hands of this request: whichever had it before is interrupted.
+/// As [`found`], in the hands of this request.
 async fn take(state: &AppState, path: &UploadPath, headers: &HeaderMap) -> Result<(Taken, Upload), ApiError> {
     found(state, path, headers).await?;
+    take_over(state, path).await
+}
+
+/// An upload that was found, in the hands of this request as whichever had it before leaves it, which is interrupted.
+async fn take_over(state: &AppState, path: &UploadPath) -> Result<(Taken, Upload), ApiError> {
     let taken = state.desk.take(path.upload).await?;
     Ok((taken, require_upload(state, path.survey, path.upload).await?))
 }
