@@ -6,7 +6,7 @@ use crate::geometry::PointCloud;
 use crate::layout::Layout;
 use crate::plant::assemble::{Identity, assemble};
 use crate::plant::{PlantId, PlantModel, Warning};
-use crate::reconstruction::{self, Photo, Project, Shot};
+use crate::reconstruction::{self, Photo, Project, ProjectFolder, Shot};
 use crate::refinement::{self, Refined, RefinementOptions};
 use progress::Clock;
 use serde::{Deserialize, Serialize};
@@ -71,7 +71,7 @@ pub struct Mapping {
 /// # Errors
 /// Broken input (by file, and with what to do), a failing environment, or cancellation.
 pub fn map_folder(
-    folder: &Path,
+    folder: &dyn ProjectFolder,
     boxes: Boxes<'_>,
     options: &MapOptions,
     subject: &Subject,
@@ -89,9 +89,9 @@ pub fn map_folder(
     let seen = match boxes {
         Boxes::Detector(detector) => {
             let chosen = images::resolving(&project, &gsd_m, options, &mut warnings);
-            images::search(&project, &chosen, &gsd_m, detector, options.max_image_pixels, &mut clock)?
+            images::search(folder, &project, &chosen, &gsd_m, detector, options.max_image_pixels, &mut clock)?
         }
-        Boxes::File(path) => images::from_boxes(&project, path, &gsd_m, options, &mut clock, &mut warnings)?,
+        Boxes::File(path) => images::from_boxes(folder, &project, path, &gsd_m, options, &mut clock, &mut warnings)?,
     };
     let found = images::modules_in(&seen, &mut warnings)?;
 
@@ -152,7 +152,7 @@ pub fn map_folder(
 ///
 /// # Errors
 /// Broken input, by file.
-pub fn photos_of(folder: &Path, max_image_pixels: u64) -> Result<Vec<(Photo, Option<f64>)>, MapError> {
+pub fn photos_of(folder: &dyn ProjectFolder, max_image_pixels: u64) -> Result<Vec<(Photo, Option<f64>)>, MapError> {
     let mut project = reconstruction::opensfm::read(folder, max_image_pixels)?;
     let cloud = cloud_of(&mut project);
     let gsd_m = images::ground_sampling_distances(&project.reconstruction.shots, &cloud);

@@ -3,6 +3,7 @@
 use crate::detection::{DetectionError, Detector};
 use crate::pipeline::{self, Boxes, Found, Loaded, MapError, MapOptions, Observer, Subject, search};
 use crate::plant::PlantModel;
+use crate::reconstruction::ProjectFolder;
 use crate::store::{Digest, TaskClaim};
 use std::path::Path;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError, TryLockError};
@@ -12,7 +13,7 @@ pub trait Mapper: Send + Sync + 'static {
     /// As [`pipeline::map_folder`], of which only the model counts.
     fn map(
         &self,
-        folder: &Path,
+        folder: &dyn ProjectFolder,
         options: &MapOptions,
         subject: &Subject,
         observer: &dyn Observer,
@@ -86,19 +87,19 @@ impl PipelineMapper {
 impl Mapper for PipelineMapper {
     fn map(
         &self,
-        folder: &Path,
+        folder: &dyn ProjectFolder,
         options: &MapOptions,
         subject: &Subject,
         observer: &dyn Observer,
     ) -> Result<PlantModel, MapError> {
-        let boxes = folder.join(BOXES_FILE);
+        let boxes = folder.path().join(BOXES_FILE);
         let mapping = if boxes.is_file() {
             pipeline::map_folder(folder, Boxes::File(&boxes), options, subject, observer)
         } else {
             let detector = self.detector()?;
             pipeline::map_folder(folder, Boxes::Detector(&*detector), options, subject, observer)
         };
-        let mapping = mapping.map_err(|error| as_in_the_survey(error, folder))?;
+        let mapping = mapping.map_err(|error| as_in_the_survey(error, folder.path()))?;
         for timing in &mapping.timings {
             tracing::debug!(stage = timing.stage.as_str(), seconds = timing.wall.as_secs_f64(), "stage finished");
         }

@@ -1,10 +1,12 @@
 //! A worker: claims a job, maps its survey, hands in the model.
 
+use super::folder::JobFolder;
 use super::share::Share;
 use super::watch::{Stop, Watch};
-use super::{AttemptError, Mapper, folder, rows};
+use super::{AttemptError, Mapper, rows};
 use crate::pipeline::{MapError, MapOptions, Subject};
 use crate::plant::PlantModel;
+use crate::reconstruction::ProjectFolder;
 use crate::store::{Blobs, Claim, Completed, Digest, Ending, FileRecord, Heartbeat, NewModel, Store, StoreError};
 use crate::telemetry::Metrics;
 use crate::telemetry::metrics::OutcomeLabels;
@@ -209,7 +211,7 @@ impl Worker {
         }
         let pace = self.store.last_stage_ms().await?;
         watch.begin(fingerprint.clone(), &known, pace.and_then(|text| serde_json::from_str(&text).ok()));
-        let folder = folder::lay_out(&self.blobs, job.plant, &files).await?;
+        let folder = JobFolder::lay_out(&self.blobs, job.plant, &files).await?;
         watch.share(Share {
             store: self.store.clone(),
             claim: claim.clone(),
@@ -225,7 +227,7 @@ impl Worker {
         let span = tracing::Span::current();
         let mapping = tokio::task::spawn_blocking(move || {
             let _entered = span.enter();
-            let mut model = mapper.map(folder.path(), &options, &subject, &*observer)?;
+            let mut model = mapper.map(&folder, &options, &subject, &*observer)?;
             model.version = version;
             let bytes = serde_json::to_vec(&model).map_err(std::io::Error::from)?;
             let layers = rows::layers(&model);

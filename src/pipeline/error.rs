@@ -20,7 +20,10 @@ pub enum MapError {
 
 impl From<ReadError> for MapError {
     fn from(error: ReadError) -> Self {
-        Self::Input { code: error.code(), message: error.to_string() }
+        match error {
+            ReadError::NotFetched { .. } => Self::Environment { message: error.to_string() },
+            _ => Self::Input { code: error.code(), message: error.to_string() },
+        }
     }
 }
 

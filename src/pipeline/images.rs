@@ -8,7 +8,7 @@ use crate::detection::{Detector, ImageDetections};
 use crate::geometry::PointCloud;
 use crate::layout::{self, Layout, LayoutOptions};
 use crate::plant::Warning;
-use crate::reconstruction::{Photo, Project, ReadError, Shot};
+use crate::reconstruction::{Photo, Project, ProjectFolder, Shot};
 use nalgebra::Vector3;
 use rayon::prelude::*;
 use std::collections::{HashMap, HashSet};
@@ -109,6 +109,7 @@ impl Seen {
 
 /// Detects and lays out image by image, those apart that an earlier run or others have searched.
 pub(super) fn search(
+    folder: &dyn ProjectFolder,
     project: &Project,
     chosen: &[usize],
     gsd_m: &[Option<f64>],
@@ -147,7 +148,7 @@ pub(super) fn search(
             Turn::Search(image) => {
                 left.retain(|other| *other != image);
                 let shot = shots[image];
-                let pixels = project.photos[shot].load().map_err(|error| ReadError::Photo(error).into());
+                let pixels = folder.load(&project.photos[shot]).map_err(MapError::from);
                 let name = sought[image].image.clone();
                 return Some(pixels.map(|pixels| Loaded { key: image, image: name, pixels, gsd_m: gsd_m[shot] }));
             }
@@ -186,6 +187,7 @@ fn recalled(project: &Project, chosen: &[usize], observer: &dyn Observer) -> (Ve
 
 /// Takes the boxes of a file instead of searching; images are decoded only to look at the ground between modules.
 pub(super) fn from_boxes(
+    folder: &dyn ProjectFolder,
     project: &Project,
     path: &Path,
     gsd_m: &[Option<f64>],
@@ -292,8 +294,7 @@ pub(super) fn from_boxes(
                 if observer.cancelled() {
                     return Err(MapError::Cancelled);
                 }
-                let grey = project.photos[shot].load().map(|image| image::imageops::grayscale(&image));
-                let grey = grey.map_err(ReadError::Photo)?;
+                let grey = image::imageops::grayscale(&folder.load(&project.photos[shot])?);
                 let layout = layout::infer(&detections, Some(&grey), &LayoutOptions::default());
                 Ok(Seen { shot, detections, layout })
             })

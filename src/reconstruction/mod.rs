@@ -2,6 +2,7 @@
 
 pub mod error;
 pub mod exif;
+mod folder;
 mod jpeg;
 pub mod opensfm;
 pub mod photo;
@@ -10,6 +11,7 @@ pub mod quality;
 
 use crate::geometry::{Camera, GeodeticReference, PointCloud, Pose};
 pub use error::ReconstructionError;
+pub use folder::ProjectFolder;
 use nalgebra::Vector3;
 pub use photo::{Photo, PhotoError, PhotoFacts};
 
@@ -72,6 +74,9 @@ pub enum ReadError {
          these shots from the reconstruction"
     )]
     ShotWithoutImage { reconstruction: String, shots: String, count: usize },
+    /// Where the photo is kept did not give it; trying again may help.
+    #[error("{name} cannot be fetched: {reason}")]
+    NotFetched { name: String, reason: String },
 }
 
 impl ReadError {
@@ -82,6 +87,7 @@ impl ReadError {
             Self::Photo(error) => error.code(),
             Self::OtherImages { .. } => "reconstruction_of_other_images",
             Self::ShotWithoutImage { .. } => "shot_without_image",
+            Self::NotFetched { .. } => "image_not_fetched",
         }
     }
 }

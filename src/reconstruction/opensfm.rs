@@ -1,8 +1,8 @@
 //! Reads what OpenSfM leaves in its project folder.
 
 use super::error::ReconstructionError;
-use super::photo::{self, Photo, PhotoError};
-use super::{Project, Reconstruction, Shot, ply};
+use super::photo::{Photo, PhotoError, PhotoHeader, file_name};
+use super::{Project, ProjectFolder, Reconstruction, Shot, ply};
 use crate::geometry::camera::Lens;
 use crate::geometry::{Camera, GeodeticReference, Lla, Pose};
 use nalgebra::Vector3;
@@ -72,7 +72,8 @@ struct ReferenceEntry {
 ///
 /// # Errors
 /// What is missing, broken or does not fit together, by file and with what to do.
-pub fn read(folder: &Path, max_pixels: u64) -> Result<Project, super::ReadError> {
+pub fn read(project: &dyn ProjectFolder, max_pixels: u64) -> Result<Project, super::ReadError> {
+    let folder = project.path();
     let original = folder.join("reconstruction.json");
     let undistorted = folder.join("undistorted").join("reconstruction.json");
     if !original.is_file() && !undistorted.is_file() {
@@ -147,12 +148,12 @@ pub fn read(folder: &Path, max_pixels: u64) -> Result<Project, super::ReadError>
                 what: format!("shot {name} names camera `{}`, which is not there", entry.camera),
             })?;
             let flat = undistorted_camera_of.get(name.as_str()).copied().unwrap_or_else(|| own.undistorted());
-            let Some((path, stored)) = find_photo(folder, name, own, flat) else {
+            let Some((place, stored, header)) = find_photo(project, name, own, flat, max_pixels)? else {
                 missing.push(name);
                 continue;
             };
-            let header = photo::inspect(&path, &file_name(&path), max_pixels)?;
-            let photo = Photo { shot: name.clone(), path, header, camera: fitted(&stored, name, header, &mut notes) };
+            let camera = fitted(&stored, name, header, &mut notes);
+            let photo = Photo { shot: name.clone(), path: folder.join(place), header, camera };
             shots.push(Shot {
                 name: name.clone(),
                 camera: photo.undistorted_camera(),
@@ -174,7 +175,7 @@ pub fn read(folder: &Path, max_pixels: u64) -> Result<Project, super::ReadError>
         );
     }
     if !missing.is_empty() {
-        return Err(missing_photos(folder, source, &missing, shot_count));
+        return Err(missing_photos(project, source, &missing, shot_count));
     }
     shots.sort_by(|a, b| a.name.cmp(&b.name));
     photos.sort_by(|a, b| a.shot.cmp(&b.shot));
@@ -195,10 +196,6 @@ pub fn read(folder: &Path, max_pixels: u64) -> Result<Project, super::ReadError>
     let reconstruction = Reconstruction { reference, shots, sparse_points_m, dense };
     notes.extend(implausible_gnss(&reconstruction));
     Ok(Project { reconstruction, photos, notes })
-}
-
-fn file_name(path: &Path) -> String {
-    path.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned())
 }
 
 /// Reads a JSON file whole, its size bounded.
@@ -297,22 +294,30 @@ fn camera(path: &Path, name: &str, entry: &CameraEntry) -> Result<Camera, Recons
     Ok(camera)
 }
 
-/// The file that shows a shot, and the camera of that file: the undistorted image first, then the original one.
-fn find_photo(folder: &Path, shot: &str, original: Camera, flat: Camera) -> Option<(PathBuf, Camera)> {
-    if Path::new(shot).file_name()?.to_str()? != shot {
-        return None;
+/// The file that shows a shot, relative to the folder, with the camera of that file and its header: the undistorted image
+/// first, then the original one.
+fn find_photo(
+    project: &dyn ProjectFolder,
+    shot: &str,
+    original: Camera,
+    flat: Camera,
+    max_pixels: u64,
+) -> Result<Option<(PathBuf, Camera, PhotoHeader)>, PhotoError> {
+    if Path::new(shot).file_name().and_then(|name| name.to_str()) != Some(shot) {
+        return Ok(None);
     }
-    let undistorted = folder.join("undistorted").join("images");
-    let suffixed = ["", ".jpg", ".tif", ".png"].map(|suffix| undistorted.join(format!("{shot}{suffix}")));
-    if let Some(path) = suffixed.into_iter().find(|path| path.is_file()) {
-        return Some((path, flat));
+    let undistorted = Path::new("undistorted").join("images");
+    let undistorted = ["", ".jpg", ".tif", ".png"].map(|suffix| (undistorted.join(format!("{shot}{suffix}")), flat));
+    for (place, camera) in undistorted.into_iter().chain([(Path::new("images").join(shot), original)]) {
+        if let Some(header) = project.inspect(&place, max_pixels)? {
+            return Ok(Some((place, camera, header)));
+        }
     }
-    let path = folder.join("images").join(shot);
-    path.is_file().then_some((path, original))
+    Ok(None)
 }
 
 /// The camera at the size that the file really has; a note where the shape disagrees.
-fn fitted(camera: &Camera, shot: &str, header: photo::PhotoHeader, notes: &mut Vec<super::Note>) -> Camera {
+fn fitted(camera: &Camera, shot: &str, header: PhotoHeader, notes: &mut Vec<super::Note>) -> Camera {
     let (expected, found) = (
         f64::from(camera.width_px) / f64::from(camera.height_px),
         f64::from(header.width_px) / f64::from(header.height_px),
@@ -329,20 +334,13 @@ fn fitted(camera: &Camera, shot: &str, header: photo::PhotoHeader, notes: &mut V
     camera.resized(header.width_px, header.height_px)
 }
 
-fn missing_photos(folder: &Path, source: &Path, missing: &[&str], shots: usize) -> super::ReadError {
-    let mut there: Vec<String> = std::fs::read_dir(folder.join("images"))
-        .into_iter()
-        .flatten()
-        .flatten()
-        .map(|entry| entry.file_name().to_string_lossy().into_owned())
-        .collect();
-    there.sort();
+fn missing_photos(project: &dyn ProjectFolder, source: &Path, missing: &[&str], shots: usize) -> super::ReadError {
     let source = file_name(source);
     if missing.len() == shots {
         return super::ReadError::OtherImages {
             reconstruction: source,
             shot: missing[0].to_owned(),
-            image: there.first().cloned().unwrap_or_else(|| "none at all".to_owned()),
+            image: project.images().into_iter().next().unwrap_or_else(|| "none at all".to_owned()),
         };
     }
     super::ReadError::ShotWithoutImage {

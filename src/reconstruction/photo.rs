@@ -58,6 +58,41 @@ pub struct PhotoHeader {
     pub format: ImageFormat,
 }
 
+impl PhotoHeader {
+    /// Of the photo `name`, which [`inspect`] let through before and found to be of this size, width and height in pixels;
+    /// `None` where the name does not tell the format.
+    ///
+    /// # Errors
+    /// More than `max_pixels`.
+    pub fn known(name: &str, [width_px, height_px]: [u32; 2], max_pixels: u64) -> Result<Option<Self>, PhotoError> {
+        let Some(format) = format_by_name(name) else { return Ok(None) };
+        Self { width_px, height_px, format }.within(name, max_pixels).map(Some)
+    }
+
+    fn within(self, name: &str, limit: u64) -> Result<Self, PhotoError> {
+        let Self { width_px: width, height_px: height, .. } = self;
+        if u64::from(width) * u64::from(height) <= limit {
+            return Ok(self);
+        }
+        Err(PhotoError::TooLarge { name: name.to_owned(), width, height, limit })
+    }
+}
+
+/// The last part of a path.
+pub(crate) fn file_name(path: &Path) -> String {
+    path.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned())
+}
+
+fn format_by_name(name: &str) -> Option<ImageFormat> {
+    let extension = Path::new(name).extension().and_then(|e| e.to_str()).unwrap_or("").to_ascii_lowercase();
+    match extension.as_str() {
+        "jpg" | "jpeg" => Some(ImageFormat::Jpeg),
+        "png" => Some(ImageFormat::Png),
+        "tif" | "tiff" => Some(ImageFormat::Tiff),
+        _ => None,
+    }
+}
+
 fn format_name(format: ImageFormat) -> &'static str {
     match format {
         ImageFormat::Jpeg => "JPEG",
@@ -83,14 +118,7 @@ pub fn inspect(path: &Path, name: &str, max_pixels: u64) -> Result<PhotoHeader, 
         .ok()
         .filter(|format| matches!(format, ImageFormat::Jpeg | ImageFormat::Png | ImageFormat::Tiff))
         .ok_or_else(|| not_an_image("it begins otherwise"))?;
-    let extension = Path::new(name).extension().and_then(|e| e.to_str()).unwrap_or("").to_ascii_lowercase();
-    let named = match extension.as_str() {
-        "jpg" | "jpeg" => Some(ImageFormat::Jpeg),
-        "png" => Some(ImageFormat::Png),
-        "tif" | "tiff" => Some(ImageFormat::Tiff),
-        _ => None,
-    };
-    if let Some(named) = named.filter(|named| *named != format) {
+    if let Some(named) = format_by_name(name).filter(|named| *named != format) {
         return Err(PhotoError::WrongName {
             name: name.to_owned(),
             named: format_name(named),
@@ -114,15 +142,7 @@ pub fn inspect(path: &Path, name: &str, max_pixels: u64) -> Result<PhotoHeader, 
     if width_px == 0 || height_px == 0 {
         return Err(not_an_image("it has no pixels"));
     }
-    if !within(size_px) {
-        return Err(PhotoError::TooLarge {
-            name: name.to_owned(),
-            width: width_px,
-            height: height_px,
-            limit: max_pixels,
-        });
-    }
-    Ok(PhotoHeader { width_px, height_px, format })
+    PhotoHeader { width_px, height_px, format }.within(name, max_pixels)
 }
 
 /// Walks a PNG's chunks to its end.
@@ -245,8 +265,7 @@ impl Photo {
     /// # Errors
     /// Data that does not decode.
     pub fn load(&self) -> Result<RgbImage, PhotoError> {
-        let name = self.path.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned());
-        let decoded = decode(&self.path, &name, self.header.format)?.into_rgb8();
+        let decoded = decode(&self.path, &file_name(&self.path), self.header.format)?.into_rgb8();
         if self.camera.is_undistorted() { Ok(decoded) } else { Ok(undistort(&decoded, &self.camera)) }
     }
 }

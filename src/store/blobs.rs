@@ -247,7 +247,8 @@ impl Blobs {
 
     /// Copies a blob to the new file `target` and checks it on the way.
     pub async fn copy(&self, plant: PlantId, sha256: Digest, target: &Path) -> Result<(), StoreError> {
-        let mut file = tokio::fs::File::create(target).await.map_err(io("create", target))?;
+        // Never over what is there: that may be a hard link to a blob.
+        let mut file = tokio::fs::File::create_new(target).await.map_err(io("create", target))?;
         let mut chunks = self.store.get(&key(plant, sha256)).await?.into_stream();
         let mut hasher = sha2::Sha256::new();
         while let Some(chunk) = chunks.try_next().await? {

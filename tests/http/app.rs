@@ -3,7 +3,7 @@
 use axum::http::HeaderValue;
 use heliomap::config::{Limits, NetworkArgs};
 use heliomap::detection::{Detector, ImageDetections};
-use heliomap::geometry::{GeodeticReference, Lla};
+use heliomap::geometry::{Camera, GeodeticReference, Lla};
 use heliomap::http::{AppState, router, serve};
 use heliomap::jobs::{FoundInTask, Mapper, NextTask, PipelineMapper, Stopped, Worker, WorkerSettings};
 use heliomap::oidc::Oidc;
@@ -11,6 +11,7 @@ use heliomap::pipeline::{Found, MapError, MapOptions, Observer, Stage, Subject};
 use heliomap::plant::{
     Bench, BenchId, Line, LineId, Module, ModuleId, ModuleStatus, PlantId, PlantModel, Sector, SectorId, Warning,
 };
+use heliomap::reconstruction::{Photo, ProjectFolder};
 use heliomap::store::{Blobs, Created, NewKey, Scope, Secret, SqliteStore, Store};
 use heliomap::telemetry::Metrics;
 use heliomap::webhooks::Targets;
@@ -51,7 +52,7 @@ pub enum Act {
 /// Does as it is told, then as it was told last.
 pub struct ScriptedMapper {
     acts: Mutex<VecDeque<Act>>,
-    /// The files of the folders it was given.
+    /// The files of the folders it was given, and the photos that it could load.
     pub seen: Mutex<Vec<Vec<String>>>,
     /// The end of the test, which waits for no mapper.
     closing: CancellationToken,
@@ -60,13 +61,23 @@ pub struct ScriptedMapper {
 impl Mapper for ScriptedMapper {
     fn map(
         &self,
-        folder: &Path,
+        folder: &dyn ProjectFolder,
         options: &MapOptions,
         subject: &Subject,
         observer: &dyn Observer,
     ) -> Result<PlantModel, MapError> {
         let mut files = Vec::new();
-        list(folder, folder, &mut files);
+        list(folder.path(), folder.path(), &mut files);
+        for name in folder.images() {
+            let place = Path::new("images").join(&name);
+            let header = folder.inspect(&place, u64::MAX).unwrap().unwrap();
+            let camera = Camera::pinhole(header.width_px, header.height_px, 0.8);
+            let photo = Photo { shot: name, path: folder.path().join(&place), header, camera };
+            let picture = folder.load(&photo)?;
+            assert_eq!(picture.dimensions(), (header.width_px, header.height_px));
+            assert!(!photo.path.exists());
+            files.push(place.to_str().unwrap().to_owned());
+        }
         files.sort();
         self.seen.lock().unwrap().push(files);
         let act = {

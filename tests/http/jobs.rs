@@ -1,4 +1,5 @@
-use crate::app::{Act, App, assert_problem, job_path, plant_path};
+use crate::app::{Act, App, assert_problem, job_path, jpeg, plant_path};
+use heliomap::store::Digest;
 use reqwest::StatusCode;
 use serde_json::json;
 use std::time::Duration;
@@ -18,6 +19,24 @@ async fn from_upload_to_model() {
     let (status, model) = app.get(job["model"].as_str().unwrap()).await;
     assert_eq!((status, &model["layers"][0]["features"]), (StatusCode::OK, &json!(3)));
     assert_eq!(std::fs::read_dir(app.folder.path().join("incoming")).unwrap().count(), 0);
+}
+
+#[tokio::test]
+async fn a_photo_that_the_storage_does_not_give_is_asked_for_again() {
+    let app = App::new(&[Act::Map(3)]).await;
+    let survey = app.complete_survey().await;
+    let digest = Digest::of(&jpeg(32, 24)).to_string();
+    let plant = plant_path(&survey).rsplit('/').next().unwrap();
+    let blob = app.folder.path().join("blobs/plants").join(plant).join(&digest[..2]).join(&digest);
+    std::fs::remove_file(&blob).unwrap();
+    let job = app.map(&survey).await;
+    assert_eq!(
+        (&job["state"], &job["attempt"], &job["error"]["code"]),
+        (&json!("failed"), &json!(3), &json!("environment"))
+    );
+    assert_eq!(job["error"]["message"], "a.jpg cannot be fetched: the service's storage failed; its log says more");
+    std::fs::write(&blob, jpeg(32, 24)).unwrap();
+    assert_eq!(app.map(&survey).await["state"], "succeeded");
 }
 
 #[tokio::test]
@@ -146,7 +165,7 @@ async fn a_job_goes_on_where_it_was_and_getting_somewhere_gives_its_attempts_bac
     let survey = app.complete_survey().await;
     let (_, job) = app.post(&format!("{survey}/jobs"), json!({})).await;
     app.follow_until(&job, |job| job["state"] == "running" && job["attempt"] == 2).await;
-    app.put(&format!("{survey}/images/a.jpg"), crate::app::jpeg(64, 48)).await;
+    app.put(&format!("{survey}/images/a.jpg"), jpeg(64, 48)).await;
     app.post(&format!("{}/cancel", job_path(&job)), json!(null)).await;
     assert_eq!(app.follow(&job).await["state"], "cancelled");
     let (_, job) = app.post(&format!("{survey}/jobs"), json!({})).await;
