@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 use tokio::runtime::Handle;
 
 /// How often it is looked whether others have found something.
-const GATHER_EVERY: Duration = Duration::from_millis(300);
+const GATHER_EVERY: Duration = Duration::from_millis(100);
 
 /// What a worker needs to know of an image to search it.
 #[derive(Debug, Serialize, Deserialize)]

@@ -61,7 +61,7 @@ pub struct Worker {
     pub mapper: Arc<dyn Mapper>,
     pub settings: WorkerSettings,
     pub metrics: Metrics,
-    /// Rung when a job was queued in this process.
+    /// Rung when there may be work: by this process when it queues a job, and by the store.
     pub bell: Arc<Notify>,
 }
 
@@ -69,14 +69,22 @@ impl Worker {
     /// Runs until `stop`; a job that is running then goes back to the queue.
     pub async fn run(&self, stop: CancellationToken) {
         tracing::info!(worker = self.name, "worker started");
+        tokio::select! {
+            () = self.store.ring_for_work(&self.bell) => {}
+            () = self.look_for_work(&stop) => {}
+        }
+        tracing::info!(worker = self.name, "worker stopped");
+    }
+
+    async fn look_for_work(&self, stop: &CancellationToken) {
         while !stop.is_cancelled() {
             let pause = match self.store.claim_job(&self.name, self.settings.lease, Timestamp::now()).await {
                 Ok(Some(claim)) => {
                     let span = tracing::info_span!("job", job = %claim.job.id, plant = %claim.job.plant, attempt = claim.job.attempt);
-                    self.work(claim, &stop).instrument(span).await;
+                    self.work(claim, stop).instrument(span).await;
                     continue;
                 }
-                Ok(None) => match self.help(&stop).await {
+                Ok(None) => match self.help(stop).await {
                     Ok(0) => self.settings.poll,
                     Ok(images) => {
                         tracing::info!(images, "helped with the images of other workers' jobs");
@@ -98,7 +106,6 @@ impl Worker {
                 () = tokio::time::sleep(pause) => {}
             }
         }
-        tracing::info!(worker = self.name, "worker stopped");
     }
 
     /// Runs one job to whatever end.

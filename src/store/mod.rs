@@ -47,6 +47,7 @@ pub use webhooks::{
 use crate::plant::{Layer, ModuleId, PlantId};
 use jiff::Timestamp;
 use std::time::Duration;
+use tokio::sync::Notify;
 
 /// Why the store could not do as told.
 #[derive(Debug, thiserror::Error)]
@@ -102,6 +103,9 @@ impl StoreError {
 pub trait Store: AccessStore + UploadStore + RequestStore + TaskStore + WebhookStore + UsageStore {
     /// Fails where the database does not answer.
     async fn ping(&self) -> Result<(), StoreError>;
+    /// Rings, for as long as it is polled, when any process has queued a job, offered images or left work undone. A database
+    /// that tells nothing, or just now does not, never rings: whoever waits for work looks for it now and then, too.
+    async fn ring_for_work(&self, bell: &Notify);
 
     /// Creates an organisation's plant, or finds the one of that name. [`StoreError::OverQuota`] where it has as many as it
     /// may; `defaults` holds for what was not said of the organisation alone.

@@ -5,9 +5,10 @@ mod backend;
 
 use super::StoreError;
 use super::schema::Examined;
-use sqlx::postgres::{PgPool, PgPoolOptions};
+use sqlx::postgres::{PgListener, PgPool, PgPoolOptions};
 use sqlx::{Postgres, Transaction};
 use std::time::Duration;
+use tokio::sync::Notify;
 
 use PostgresStore as Rows;
 use sqlx::postgres::PgRow as Row;
@@ -27,6 +28,10 @@ const LET_GO: &str = "\
     SET tcp_keepalives_interval = 5; SET tcp_keepalives_count = 3";
 /// The lock under which jobs are queued and claimed: any number, as long as nothing else in the database takes it.
 const QUEUE_LOCK: i64 = 0x6865_6c69_6f6d_6170;
+/// The channel on which workers hear that there may be work.
+const WORK: &str = "heliomap_work";
+/// How long after a lost connection it is listened again.
+const LISTEN_AGAIN: Duration = Duration::from_secs(10);
 
 /// The rows in a Postgres database.
 #[derive(Debug, Clone)]
@@ -70,4 +75,29 @@ impl PostgresStore {
         sqlx::query("SELECT pg_advisory_xact_lock($1)").bind(QUEUE_LOCK).execute(&mut *tx).await?;
         Ok(tx)
     }
+
+    /// Rings at every message of [`tell_of_work`], from whichever process.
+    async fn listen(&self, bell: &Notify) {
+        loop {
+            if let Err(error) = self.listen_while_it_lasts(bell).await {
+                tracing::warn!(%error, "the database tells of no work now: it is looked for now and then");
+            }
+            tokio::time::sleep(LISTEN_AGAIN).await;
+        }
+    }
+
+    async fn listen_while_it_lasts(&self, bell: &Notify) -> Result<(), sqlx::Error> {
+        let mut listener = PgListener::connect_with(&self.read).await?;
+        listener.listen(WORK).await?;
+        loop {
+            listener.recv().await?;
+            bell.notify_one();
+        }
+    }
+}
+
+/// Tells all that listen, when the transaction is committed, that there may be work.
+async fn tell_of_work(tx: &mut Tx) -> Result<(), StoreError> {
+    sqlx::query("SELECT pg_notify($1, '')").bind(WORK).execute(&mut **tx).await?;
+    Ok(())
 }

@@ -82,6 +82,12 @@ on_both!(
     images_go_with_their_job,
 );
 
+/// Workers of other processes need not wait until they look.
+#[tokio::test]
+async fn postgres_rings_for_work() {
+    conformance::work_is_told(&postgres_store().await).await;
+}
+
 /// A data folder of before there were organisations keeps all that it holds.
 #[tokio::test]
 async fn what_was_there_before_is_kept() {

@@ -17,13 +17,14 @@ use super::super::{
     NewModel, OrganisationId, Page, Plant, Pool, Progress, Queue, Quotas, Store, StoreError, Survey, SurveyId,
     SurveyPath, TaskStore, Wanted,
 };
-use super::{Db, Row, Rows, Tx};
+use super::{Db, Row, Rows, Tx, tell_of_work};
 use crate::plant::{Layer, ModuleId, PlantId};
 use async_trait::async_trait;
 use jiff::Timestamp;
 use read::{file, job, model, plant, survey};
 use sqlx::{QueryBuilder, Row as _};
 use std::time::Duration;
+use tokio::sync::Notify;
 use uuid::Uuid;
 use webhooks::announce;
 
@@ -39,6 +40,10 @@ impl Store for Rows {
     async fn ping(&self) -> Result<(), StoreError> {
         sqlx::query(sql::PING).execute(&self.read).await?;
         Ok(())
+    }
+
+    async fn ring_for_work(&self, bell: &Notify) {
+        self.listen(bell).await;
     }
 
     async fn create_plant(
@@ -243,7 +248,10 @@ impl Store for Rows {
             .await
             .map_err(gone("survey"))?;
         let enqueued = match row {
-            Some(row) => Enqueued::New(job(&row)?),
+            Some(row) => {
+                tell_of_work(&mut tx).await?;
+                Enqueued::New(job(&row)?)
+            }
             None => {
                 let query = sqlx::query(sql::UNFINISHED_JOB).bind(request.survey.to_string());
                 Enqueued::Existing(job(&query.fetch_one(&mut *tx).await?)?)
@@ -492,6 +500,9 @@ impl Store for Rows {
             .bind(attempts_back)
             .execute(&mut *tx)
             .await?;
+        if matches!(ending, Ending::Released) {
+            tell_of_work(&mut tx).await?;
+        }
         sweep(&mut tx).await?;
         if finished_ms.is_some() {
             announce(&mut tx, claim.job.id, now).await?;

@@ -1,6 +1,6 @@
 //! Images of running jobs that other workers may search.
 
-use super::super::Rows;
+use super::super::{Rows, tell_of_work};
 use super::{after, read};
 use crate::plant::PlantId;
 use crate::store::{Checkpoint, Claim, GivenBack, ImageTask, JobId, OwnTask, StoreError, TaskClaim, TaskStore, sql};
@@ -36,6 +36,9 @@ impl TaskStore for Rows {
                 .bind(&task.document)
                 .execute(&mut *tx)
                 .await?;
+        }
+        if !tasks.is_empty() {
+            tell_of_work(&mut tx).await?;
         }
         tx.commit().await?;
         Ok(true)
@@ -143,8 +146,13 @@ impl TaskStore for Rows {
     }
 
     async fn give_back_task(&self, claim: &TaskClaim, to: GivenBack) -> Result<(), StoreError> {
+        let mut tx = self.begin().await?;
         let query = sqlx::query(sql::GIVE_BACK_TASK).bind(claim.token.to_string());
-        query.bind(to == GivenBack::ToOwner).execute(&self.write).await?;
+        query.bind(to == GivenBack::ToOwner).execute(&mut *tx).await?;
+        if to == GivenBack::ToAll {
+            tell_of_work(&mut tx).await?;
+        }
+        tx.commit().await?;
         Ok(())
     }
 }

@@ -2,6 +2,8 @@
 
 use super::{LEASE, at, claim, enqueue, plant, survey};
 use heliomap::store::{Checkpoint, Ending, GivenBack, ImageTask, OwnTask, Store};
+use std::time::Duration;
+use tokio::sync::Notify;
 
 fn tasks(images: &[&str]) -> Vec<ImageTask> {
     let task = |image: &&str| ImageTask { image: (*image).to_owned(), document: format!("about {image}") };
@@ -46,6 +48,46 @@ pub async fn images_of_a_job_are_shared(store: &dyn Store) {
     let own: Vec<_> = ["b", "c", "d"].map(|name| Checkpoint { name: name.to_owned(), document: vec![1] }).into();
     assert!(store.checkpoint(&owner, "f", &own).await.unwrap());
     assert_eq!(store.checkpoints(owner.job.id, "f").await.unwrap().len(), 4);
+}
+
+pub async fn work_is_told(store: &dyn Store) {
+    let plant = plant(store, "A").await.id;
+    let (june, july) = (survey(store, plant, "June").await, survey(store, plant, "July").await);
+    let bell = Notify::new();
+    let rung = async |after: &str| {
+        let rung = tokio::time::timeout(Duration::from_secs(20), bell.notified()).await;
+        rung.unwrap_or_else(|_| panic!("nothing rang after {after}"));
+    };
+    let script = async {
+        enqueue(store, &june).await;
+        let owner = claim(store, 0).await.unwrap();
+        // Since when it is listened is not known.
+        loop {
+            assert!(store.offer_tasks(&owner, "f", "v", &tasks(&["a"])).await.unwrap());
+            if tokio::time::timeout(Duration::from_millis(50), bell.notified()).await.is_ok() {
+                break;
+            }
+        }
+        // Until all of that was heard.
+        while tokio::time::timeout(Duration::from_millis(200), bell.notified()).await.is_ok() {}
+        enqueue(store, &july).await;
+        rung("a job was queued").await;
+        store.offer_tasks(&owner, "f", "v", &tasks(&["a"])).await.unwrap();
+        rung("images were offered").await;
+        let helper = store.take_task("v", LEASE, at(0)).await.unwrap().unwrap();
+        store.give_back_task(&helper, GivenBack::ToAll).await.unwrap();
+        rung("an image was given back").await;
+        store.end_job(&owner, &Ending::Released, at(1)).await.unwrap();
+        rung("a job was given back").await;
+    };
+    tokio::time::timeout(Duration::from_secs(60), async {
+        tokio::select! {
+            () = store.ring_for_work(&bell) => unreachable!("it rings for as long as it is polled"),
+            () = script => {}
+        }
+    })
+    .await
+    .expect("it rings");
 }
 
 pub async fn images_in_silent_hands_come_back(store: &dyn Store) {
