@@ -185,6 +185,7 @@ impl Observer for Watch {
         }
         if seen.begun.last().is_none_or(|(last, _)| *last < stage) {
             seen.begun.push((stage, Instant::now()));
+            tracing::debug!(stage = stage.as_str(), "stage begins");
             let name = format!("stage {}", stage.as_str());
             // The one before ends first.
             seen.span = None;

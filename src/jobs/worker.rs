@@ -242,6 +242,7 @@ impl Worker {
         });
         let (bytes, layers, warnings) = mapping.await.map_err(|_| AttemptError::Panicked)??;
         let (sha256, size) = (Digest::of(&bytes), bytes.len() as u64);
+        tracing::debug!(bytes = size, "storing the model begins");
         // Where the job does not come to its end, the model is one of the blobs that nothing names.
         self.store.reserve_model(job.plant, (sha256, size), Timestamp::now()).await?;
         self.blobs.put_bytes(job.plant, bytes).await?;

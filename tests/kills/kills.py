@@ -2,7 +2,8 @@
 """Kills server and worker at random while surveys are uploaded and mapped, and checks that nothing is lost.
 
 One service without a worker and one worker run on one store. While clients upload the example survey and follow its
-job, one of the two is killed (SIGKILL) every now and then and started again at once. Each photo's name holds the next
+job, one of the two is killed (SIGKILL) every now and then and started again at once. Every other kill is aimed at a stage of
+the mapping, in turn: it comes within a moment after the worker's log says that the stage begins. Each photo's name holds the next
 photo's bytes first, so that bytes that nothing names are deleted just when they come again. Afterwards:
 
 - every file whose upload was acknowledged is in its survey, and its bytes have the digest that was acknowledged;
@@ -33,6 +34,9 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 EXAMPLE = ROOT / "examples" / "plant"
+#: What kills are aimed at, by what the worker logs at its beginning. Layouts are made while others are detected in.
+STAGES = {stage: f'"stage":"{stage}"' for stage in ("read", "detect", "locate", "fuse", "refine", "assemble")}
+STAGES["store"] = "storing the model begins"
 FINAL = ("succeeded", "failed", "cancelled")
 #: What the network throws at a client whose server dies.
 LOST = (urllib.error.URLError, ConnectionError, http.client.HTTPException, TimeoutError)
@@ -48,10 +52,19 @@ class Process:
     def __init__(self, name: str, command: list[str], folder: Path):
         self.name, self.command = name, command
         self.log = open(folder / f"{name}.log", "ab")
+        self.read = open(folder / f"{name}.log", "r", errors="replace")
         self.child: subprocess.Popen | None = None
 
     def start(self) -> None:
         self.child = subprocess.Popen(self.command, stdout=self.log, stderr=self.log)
+
+    def said_nothing_yet(self) -> None:
+        """What it has said so far does not count."""
+        self.read.seek(0, os.SEEK_END)
+
+    def says(self, what: str) -> bool:
+        """Whether it has said something since the last time."""
+        return what in self.read.read()
 
     def kill(self) -> None:
         self.child.send_signal(signal.SIGKILL)
@@ -186,6 +199,8 @@ def main() -> int:
     parser.add_argument("--database", help="a Postgres database to use in place of SQLite")
     args = parser.parse_args()
     chance = random.Random(args.seed)
+    aims = list(STAGES)
+    chance.shuffle(aims)
     folder = Path(tempfile.mkdtemp(prefix="heliomap-kills-"))
     data = folder / "data"
     port = free_port()
@@ -226,12 +241,20 @@ def main() -> int:
             client = threading.Thread(target=run, daemon=True)
             client.start()
             while client.is_alive():
-                client.join(chance.uniform(0.02, quiet_s / 2))
-                if not client.is_alive() or sum(kills.values()) >= args.kills:
+                number = sum(kills.values())
+                aim = aims[number // 2 % len(aims)] if number % 2 else None
+                if aim:
+                    worker.said_nothing_yet()
+                    while client.is_alive() and not worker.says(STAGES[aim]):
+                        time.sleep(0.002)
+                    time.sleep(chance.uniform(0, 0.02))
+                else:
+                    client.join(chance.uniform(0.02, quiet_s / 2))
+                if not client.is_alive() or number >= args.kills:
                     client.join()
                     break
-                victim = server if chance.random() < 0.4 else worker
-                key = f"{victim.name} in {current.phase}"
+                victim = server if chance.random() < (0.2 if aim else 0.4) else worker
+                key = f"{victim.name} in {aim or current.phase}"
                 kills[key] = kills.get(key, 0) + 1
                 victim.kill()
                 victim.start()
@@ -254,5 +277,5 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    os.environ.setdefault("HELIOMAP_LOG", "info")
+    os.environ.update(HELIOMAP_LOG="info,heliomap::jobs=debug", HELIOMAP_LOG_FORMAT="json")
     sys.exit(main())
