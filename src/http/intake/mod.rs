@@ -10,7 +10,9 @@ use super::conditional;
 use super::error::{ApiError, Code};
 use super::state::AppState;
 use crate::plant::PlantId;
-use crate::store::{Digest, FileKind, FileRecord, FileWritten, StagedFile, StoreError, SurveyId, SurveyPath, Wanted};
+use crate::store::{
+    Content, Digest, FileKind, FileRecord, FileWritten, StagedFile, StoreError, SurveyId, SurveyPath, Wanted,
+};
 use content::Found;
 use jiff::Timestamp;
 use std::path::Path;
@@ -42,12 +44,12 @@ const LOOK_EVERY: Duration = Duration::from_millis(50);
 /// Checks that a staged file holds what its place in the survey says.
 pub async fn check(state: &AppState, path: SurveyPath, staged: StagedFile) -> Result<Checked, ApiError> {
     let limits = state.limits.clone();
-    // Photos are decoded: a few at once, so that many that come together take neither all memory nor all cores.
-    let turn = match path.kind() {
-        FileKind::Image => {
+    // Images may be decoded: a few at once, so that many that come together take neither all memory nor all cores.
+    let turn = match path.content() {
+        Content::Image => {
             Some(state.decoding.clone().acquire_owned().await.map_err(|error| ApiError::internal(&error))?)
         }
-        FileKind::Reconstruction => None,
+        Content::Json { .. } | Content::Ply => None,
     };
     let work = tokio::task::spawn_blocking(move || {
         let found = content::check(&staged.path, &path, &limits)?;
