@@ -413,11 +413,16 @@ pub struct ImagesSummary {
     /// Images from which the reconstruction was made; left out where there is none yet.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reconstructed: Option<usize>,
-    /// Photos that were uploaded and from which the reconstruction was not made.
+    /// Photos that were uploaded and from which the reconstruction was not made, the first 1,000 of them.
     pub not_reconstructed: Vec<String>,
-    /// Images from which the reconstruction was made and that were not uploaded.
+    pub not_reconstructed_count: usize,
+    /// Images from which the reconstruction was made and that were not uploaded, the first 1,000 of them.
     pub not_uploaded: Vec<String>,
+    pub not_uploaded_count: usize,
 }
+
+/// How many photos are named where something is said of many.
+const MAX_NAMED: usize = 1000;
 
 /// A survey's files, each with its verdict, and how they go together.
 pub fn summary(files: Vec<FileRecord>) -> (ImagesSummary, Vec<FileView>) {
@@ -425,7 +430,9 @@ pub fn summary(files: Vec<FileRecord>) -> (ImagesSummary, Vec<FileView>) {
         |file: &FileRecord| (file.path.kind() == FileKind::Image).then(|| file.path.file_name().to_owned());
     let names: Vec<String> = files.iter().filter_map(photo_names).collect();
     let shots: Option<BTreeSet<String>> = jobs::shots(&files).map(|shots| shots.iter().cloned().collect());
-    let not_uploaded = jobs::shots_without_image(&files);
+    let mut not_uploaded = jobs::shots_without_image(&files);
+    let not_uploaded_count = not_uploaded.len();
+    not_uploaded.truncate(MAX_NAMED);
     let with_position =
         files.iter().filter(|file| file.photo.as_ref().is_some_and(|photo| photo.exposure.position.is_some())).count();
     let photos = files.iter().filter(|file| file.path.kind() == FileKind::Image);
@@ -435,16 +442,22 @@ pub fn summary(files: Vec<FileRecord>) -> (ImagesSummary, Vec<FileView>) {
         FileView::new(file, &twins)
     };
     let views: Vec<FileView> = files.into_iter().map(view).collect();
+    let uploaded = names.len();
+    let mut not_reconstructed: Vec<String> = match &shots {
+        Some(shots) => names.into_iter().filter(|name| !jobs::is_shot(shots, name)).collect(),
+        None => Vec::new(),
+    };
+    let not_reconstructed_count = not_reconstructed.len();
+    not_reconstructed.truncate(MAX_NAMED);
     let images = ImagesSummary {
-        uploaded: names.len(),
+        uploaded,
         with_position,
         with_warning: views.iter().filter(|view| !view.warnings.is_empty()).count(),
         reconstructed: shots.as_ref().map(BTreeSet::len),
-        not_reconstructed: match &shots {
-            Some(shots) => names.into_iter().filter(|name| !jobs::is_shot(shots, name)).collect(),
-            None => Vec::new(),
-        },
+        not_reconstructed,
+        not_reconstructed_count,
         not_uploaded,
+        not_uploaded_count,
     };
     (images, views)
 }

@@ -313,9 +313,7 @@ impl Blobs {
 
     /// Free bytes for those who are not root on the disk that takes what comes in.
     pub fn free_bytes(&self) -> Result<u64, StoreError> {
-        let found = rustix::fs::statvfs(&self.staging);
-        let found = found.map_err(|error| io("look for free space in", &self.staging)(error.into()))?;
-        Ok(found.f_bavail.saturating_mul(found.f_frsize))
+        free_bytes(&self.staging).map_err(io("look for free space in", &self.staging))
     }
 
     /// Fails where the blob store does not answer.
@@ -325,6 +323,16 @@ impl Blobs {
             None => Ok(self.store.list_with_delimiter(None).await.map(drop)?),
         }
     }
+}
+
+fn free_bytes(folder: &Path) -> std::io::Result<u64> {
+    let found = rustix::fs::statvfs(folder)?;
+    Ok(found.f_bavail.saturating_mul(found.f_frsize))
+}
+
+/// Fails as a full disk does where fewer bytes than `reserve` are free on the disk of a folder.
+pub fn keep_free(folder: &Path, reserve: u64) -> std::io::Result<()> {
+    if free_bytes(folder)? < reserve { Err(std::io::ErrorKind::StorageFull.into()) } else { Ok(()) }
 }
 
 fn key(plant: PlantId, sha256: Digest) -> Key {

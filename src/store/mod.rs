@@ -23,7 +23,7 @@ pub mod webhooks;
 mod sql;
 
 pub use access::{AccessStore, ApiKey, AuditEntry, KeyId, NewKey, Organisation, OrganisationId, Scope, SecretRecord};
-pub use blobs::{Blobs, Digest, StagedFile};
+pub use blobs::{Blobs, Digest, StagedFile, keep_free};
 pub use bucket::Bucket;
 pub use postgres::PostgresStore;
 pub use records::{

@@ -4,8 +4,8 @@ use flate2::write::GzEncoder;
 use heliomap::config::Limits;
 use reqwest::StatusCode;
 use serde_json::{Value, json};
-use std::io::{Cursor, Write};
-use zip::write::SimpleFileOptions;
+use std::io::{Cursor, Read, Write};
+use zip::write::{FullFileOptions, SimpleFileOptions};
 
 const RECONSTRUCTION: &[u8] = b"[{\"shots\": {}}]";
 const REFERENCE: &[u8] = b"{\"latitude\": 50.0, \"longitude\": 8.0, \"altitude\": 0.0}";
@@ -191,4 +191,71 @@ async fn an_archive_may_not_unpack_to_many_times_its_size() {
     let zeros = vec![b' '; 80 << 20];
     let bomb = zip(&[("reconstruction.json", &zeros)]);
     assert_problem(app.put(&format!("{survey}/reconstruction"), bomb).await, 413, "archive_too_large", "bytes");
+}
+
+#[tokio::test]
+async fn names_and_directories_that_would_fill_the_memory_are_refused() {
+    use tar::EntryType::{GNULongName, Regular, XHeader};
+    let app = App::with_limits(&[], Limits { max_entries: 30, ..Limits::default() }).await;
+    let survey = app.survey().await;
+    let put = async |body: Vec<u8>| app.put(&format!("{survey}/reconstruction"), body).await;
+    let file = ("reconstruction.json", Regular, RECONSTRUCTION);
+    for kind in [GNULongName, XHeader] {
+        let long = vec![b'x'; 2 << 20];
+        let answer = put(gzip(&tar(&[("././@LongLink", kind, &long), file]))).await;
+        assert_problem(answer, 422, "archive_unreadable", "before an entry is too long");
+    }
+    let name = vec![b'x'; 2000];
+    assert_problem(put(tar(&[("l", GNULongName, &name), file])).await, 422, "archive_unsafe", "no usable name");
+    // No more entries than allowed, but a directory as of many.
+    let mut archive = zip::ZipWriter::new(Cursor::new(Vec::new()));
+    for index in 0..20 {
+        let options = FullFileOptions::default().with_file_comment("x".repeat(65_000));
+        archive.start_file(format!("{index}"), options).unwrap();
+    }
+    assert_problem(put(archive.finish().unwrap().into_inner()).await, 413, "archive_too_large", "30 entries");
+    // Names as long as file systems have them are as good as any.
+    let deep = format!("{}/reconstruction.json", ["folder"; 40].join("/"));
+    let mut archive = tar::Builder::new(Vec::new());
+    let mut header = tar::Header::new_gnu();
+    header.set_size(RECONSTRUCTION.len() as u64);
+    archive.append_data(&mut header, deep, RECONSTRUCTION).unwrap();
+    assert_eq!(put(archive.into_inner().unwrap()).await.0, StatusCode::OK);
+}
+
+#[tokio::test]
+async fn an_archive_that_would_fill_the_disk_is_refused() {
+    let app = App::new(&[]).await;
+    let survey = app.survey().await;
+    // Room for 32 MiB, and an archive that unpacks to much more.
+    let reserve = app.blobs().free_bytes().unwrap() - (32 << 20);
+    let limits = Limits { disk_reserve: reserve, max_unpacked_ratio: 10_000, ..Limits::default() };
+    let tight = app.beside(limits).await;
+    let mut archive = tar::Builder::new(GzEncoder::new(Vec::new(), Compression::fast()));
+    let mut header = tar::Header::new_gnu();
+    let size = 512 << 20;
+    header.set_size(size);
+    let content = b"ply\n".chain(std::io::repeat(b' ')).take(size);
+    archive.append_data(&mut header, "undistorted/depthmaps/merged.ply", content).unwrap();
+    let archive = archive.into_inner().unwrap().finish().unwrap();
+    let answer = tight.put(&format!("{survey}/reconstruction"), archive).await;
+    assert_problem(answer, 507, "storage_full", "");
+    assert_eq!(std::fs::read_dir(app.folder.path().join("incoming")).unwrap().count(), 0);
+}
+
+#[tokio::test]
+async fn a_reconstruction_of_more_images_than_any_survey_has_is_refused() {
+    let app = App::new(&[]).await;
+    let survey = app.survey().await;
+    let component = |from: usize| {
+        let shots: Vec<String> = (from..from + 60_000).map(|shot| format!("\"{shot}.jpg\":0")).collect();
+        format!("{{\"shots\":{{{}}}}}", shots.join(","))
+    };
+    let put = async |body: String| app.put(&format!("{survey}/reconstruction/reconstruction.json"), body).await;
+    let both = format!("[{},{}]", component(0), component(60_000));
+    assert_problem(put(both).await, 422, "file_unreadable", "more than 100000 images");
+    assert_eq!(put(format!("[{}]", component(0))).await.0, StatusCode::CREATED);
+    let (_, told) = app.get(&format!("{survey}?limit=1")).await;
+    assert_eq!(told["images"]["not_uploaded_count"], 60_000);
+    assert_eq!(told["images"]["not_uploaded"].as_array().unwrap().len(), 1000);
 }

@@ -252,6 +252,8 @@ async fn a_file_is_put_together_from_its_parts() {
     };
     let lonely = begin(&app, &survey, 5, &metadata("filename", "b.jpg")).await;
     assert_problem(join(format!("final;{lonely}")).await, 400, "bad_request", "no part that is whole");
+    let twice = format!("final;{} {}", parts.join(" "), parts[0]);
+    assert_problem(join(twice).await, 400, "bad_request", "named twice");
     assert_eq!(join(format!("final;{}", parts.join(" "))).await.0, StatusCode::CREATED);
     assert_eq!(app.get(&survey).await.1["files"][0]["sha256"], Digest::of(&photo).to_string());
     assert_problem(app.get(&parts[0]).await, 404, "upload_not_found", "begin a new one");

@@ -191,7 +191,7 @@ async fn a_survey_says_what_is_complete_and_what_is_missing() {
     let survey = flown(&app).await;
     let (_, told) = app.get(&survey).await;
     let expected = json!({
-        "uploaded": 4, "with_position": 3, "with_warning": 4, "not_reconstructed": [], "not_uploaded": [],
+        "uploaded": 4, "with_position": 3, "with_warning": 4, "not_reconstructed": [], "not_reconstructed_count": 0, "not_uploaded": [], "not_uploaded_count": 0,
     });
     assert_eq!(told["images"], expected);
     let codes = |told: &Value| {
@@ -209,6 +209,10 @@ async fn a_survey_says_what_is_complete_and_what_is_missing() {
     assert_eq!((&told["complete"], &codes(&told)[..]), (&json!(false), &["images_not_uploaded".to_owned()][..]));
     assert_eq!(told["images"]["reconstructed"], 3);
     assert_eq!(told["images"]["not_uploaded"], json!(["lost.jpg"]));
+    assert_eq!(
+        (&told["images"]["not_uploaded_count"], &told["images"]["not_reconstructed_count"]),
+        (&json!(1), &json!(2))
+    );
     assert_eq!(told["images"]["not_reconstructed"], json!(["dark.png", "good again.jpg"]));
     assert_problem(app.post(&format!("{survey}/jobs"), json!({})).await, 409, "survey_incomplete", "lost.jpg");
     let used = format!("{survey}/images?reconstructed=true");

@@ -41,7 +41,7 @@ export interface Survey {
 export interface SurveyDetail extends Survey {
   complete: boolean;
   missing: { code: string; message: string }[];
-  images: { uploaded: number; reconstructed?: number; not_reconstructed: string[]; not_uploaded: string[] };
+  images: { uploaded: number; reconstructed?: number; not_reconstructed_count: number };
   files: { path: string; kind: string; size: number }[];
 }
 

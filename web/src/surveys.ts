@@ -108,7 +108,7 @@ export class Surveys {
       if (!isOpen()) return;
       const { files, missing, images } = detail;
       const megabytes = files.reduce((sum, file) => sum + file.size, 0) / 1e6;
-      const left = images.not_reconstructed.length;
+      const left = images.not_reconstructed_count;
       place.replaceChildren(
         h(
           "p",

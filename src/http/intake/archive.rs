@@ -2,8 +2,9 @@
 //! entry decides where anything is written.
 
 use crate::config::Limits;
-use crate::store::{Digest, InvalidPath, StagedFile, SurveyPath};
+use crate::store::{Digest, InvalidPath, StagedFile, SurveyPath, keep_free};
 use sha2::Digest as _;
+use std::cell::Cell;
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{self, BufReader, BufWriter, Read, Seek, SeekFrom, Write};
@@ -14,6 +15,14 @@ const RATIO_FLOOR: u64 = 64 << 20;
 /// How many ignored entries are named.
 const MAX_NAMED: usize = 20;
 const CHUNK: usize = 128 << 10;
+/// Longest name of an entry, bytes.
+const MAX_NAME: usize = 1024;
+/// Most bytes between the contents of two entries of a tar: headers, and records of long names.
+const MAX_BETWEEN: u64 = 1 << 20;
+/// Most bytes of a zip's directory per entry that it may have, and in any case.
+const DIRECTORY_BYTES: (u64, u64) = (256, 1 << 20);
+/// How much is unpacked before the disk is looked at again.
+const LOOK_EVERY_BYTES: u64 = 16 << 20;
 
 /// Why an archive is refused.
 #[derive(Debug, thiserror::Error)]
@@ -65,10 +74,11 @@ pub fn unpack(archive: &Path, folder: &Path, limits: &Limits) -> Result<Unpacked
         return Err(ArchiveError::NothingKnown { entries: names.len() });
     }
     let mut unpacked = Unpacked { files: Vec::new(), ignored: Vec::new(), ignored_count: 0 };
+    let mut disk = Disk { folder, reserve: limits.disk_reserve, since: 0 };
     let mut index = 0;
     reader.each(&mut |name, content| {
         match places.get(&index) {
-            Some(place) => unpacked.files.push((place.clone(), stage(content, folder)?)),
+            Some(place) => unpacked.files.push((place.clone(), disk.stage(content)?)),
             None => {
                 unpacked.ignored_count += 1;
                 if unpacked.ignored.len() < MAX_NAMED {
@@ -149,7 +159,15 @@ impl Reader<'_> {
     }
 
     fn each_of_zip(&self, file: BufReader<File>, visit: Visit<'_>) -> Result<(), ArchiveError> {
-        let mut archive = zip::ZipArchive::new(file).map_err(zip_error)?;
+        // The directory is held in memory: how much of it there may be is known before it is read.
+        let (per_entry, least) = DIRECTORY_BYTES;
+        let room = Cell::new(Some(least + per_entry * self.max_entries as u64));
+        let opened = zip::ZipArchive::new(Metered { inner: file, room: &room });
+        if room.get() == Some(0) {
+            return Err(self.too_many());
+        }
+        room.set(None);
+        let mut archive = opened.map_err(zip_error)?;
         if archive.len() > self.max_entries {
             return Err(self.too_many());
         }
@@ -184,44 +202,60 @@ impl Reader<'_> {
     fn each_of_tar(&self, file: impl Read, visit: Visit<'_>) -> Result<(), ArchiveError> {
         let mut left = self.budget;
         let mut bounded = Bounded { inner: file, left: &mut left, exceeded: false };
-        let mut archive = tar::Archive::new(&mut bounded);
-        let outcome = self.each_of_entries(&mut archive, visit);
+        let between = Cell::new(Some(MAX_BETWEEN));
+        let mut archive = tar::Archive::new(Metered { inner: &mut bounded, room: &between });
+        let outcome = self.each_of_entries(&mut archive, &between, visit);
         if bounded.exceeded {
             return Err(self.too_much());
+        }
+        if between.get() == Some(0) {
+            return Err(ArchiveError::Unreadable("what stands before an entry is too long".to_owned()));
         }
         outcome
     }
 
-    fn each_of_entries<R: Read>(&self, archive: &mut tar::Archive<R>, visit: Visit<'_>) -> Result<(), ArchiveError> {
+    /// Names are held in memory before they are known: `between` bounds what is read of anything but contents.
+    fn each_of_entries<R: Read>(
+        &self,
+        archive: &mut tar::Archive<R>,
+        between: &Cell<Option<u64>>,
+        mut visit: Visit<'_>,
+    ) -> Result<(), ArchiveError> {
         for (index, entry) in archive.entries().map_err(read_error)?.enumerate() {
             if index >= self.max_entries {
                 return Err(self.too_many());
             }
             let mut entry = entry.map_err(read_error)?;
-            let name = String::from_utf8(entry.path_bytes().into_owned()).map_err(|error| {
-                unsafe_entry(&String::from_utf8_lossy(error.as_bytes()), "has a name that is no UTF-8")
-            })?;
-            let name = name.strip_prefix("./").unwrap_or(&name).to_owned();
-            let kind = entry.header().entry_type();
-            if kind.is_dir() {
-                if !name.is_empty() {
-                    check_name(&name)?;
-                }
-                continue;
-            }
-            if kind.is_pax_global_extensions() {
-                continue;
-            }
-            check_name(&name)?;
-            if kind.is_symlink() || kind.is_hard_link() {
-                return Err(unsafe_entry(&name, "is a link"));
-            }
-            if !kind.is_file() {
-                return Err(unsafe_entry(&name, "is no plain file"));
-            }
-            visit(&name, &mut entry)?;
+            between.set(None);
+            self.look_at(&mut entry, &mut visit)?;
+            io::copy(&mut entry, &mut io::sink()).map_err(read_error)?;
+            between.set(Some(MAX_BETWEEN));
         }
         Ok(())
+    }
+
+    fn look_at<R: Read>(&self, entry: &mut tar::Entry<'_, R>, visit: &mut Visit<'_>) -> Result<(), ArchiveError> {
+        let name = String::from_utf8(entry.path_bytes().into_owned())
+            .map_err(|error| unsafe_entry(&String::from_utf8_lossy(error.as_bytes()), "has a name that is no UTF-8"))?;
+        let name = name.strip_prefix("./").unwrap_or(&name).to_owned();
+        let kind = entry.header().entry_type();
+        if kind.is_dir() {
+            if !name.is_empty() {
+                check_name(&name)?;
+            }
+            return Ok(());
+        }
+        if kind.is_pax_global_extensions() {
+            return Ok(());
+        }
+        check_name(&name)?;
+        if kind.is_symlink() || kind.is_hard_link() {
+            return Err(unsafe_entry(&name, "is a link"));
+        }
+        if !kind.is_file() {
+            return Err(unsafe_entry(&name, "is no plain file"));
+        }
+        visit(&name, entry)
     }
 
     fn too_many(&self) -> ArchiveError {
@@ -235,7 +269,7 @@ impl Reader<'_> {
 
 /// Refuses names that lead out of the folder that they are unpacked in, on any system.
 fn check_name(name: &str) -> Result<(), ArchiveError> {
-    if name.is_empty() || name.contains('\0') {
+    if name.is_empty() || name.len() > MAX_NAME || name.contains('\0') {
         return Err(unsafe_entry(name, "has no usable name"));
     }
     let drive = name.as_bytes().get(1) == Some(&b':');
@@ -265,28 +299,69 @@ fn read_error(error: io::Error) -> ArchiveError {
     ArchiveError::Unreadable(error.to_string())
 }
 
-/// Copies an entry to a file of its own.
-fn stage(content: &mut dyn Read, folder: &Path) -> Result<StagedFile, ArchiveError> {
-    let (file, path) =
-        tempfile::Builder::new().prefix("unpacked-").tempfile_in(folder).map_err(ArchiveError::Disk)?.into_parts();
-    let mut writer = BufWriter::with_capacity(CHUNK, file);
-    let mut hasher = sha2::Sha256::new();
-    let mut buffer = vec![0; CHUNK];
-    let mut size = 0;
-    loop {
-        let count = match content.read(&mut buffer) {
-            Ok(0) => break,
-            Ok(count) => count,
-            Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
-            Err(error) => return Err(read_error(error)),
-        };
-        hasher.update(&buffer[..count]);
-        writer.write_all(&buffer[..count]).map_err(ArchiveError::Disk)?;
-        size += count as u64;
+/// Where entries are unpacked.
+struct Disk<'a> {
+    folder: &'a Path,
+    /// Bytes that stay free, so that jobs that run have room for what they write.
+    reserve: u64,
+    /// Bytes since the disk was looked at.
+    since: u64,
+}
+
+impl Disk<'_> {
+    /// Copies an entry to a file of its own.
+    fn stage(&mut self, content: &mut dyn Read) -> Result<StagedFile, ArchiveError> {
+        let new = tempfile::Builder::new().prefix("unpacked-").tempfile_in(self.folder);
+        let (file, path) = new.map_err(ArchiveError::Disk)?.into_parts();
+        let mut writer = BufWriter::with_capacity(CHUNK, file);
+        let mut hasher = sha2::Sha256::new();
+        let mut buffer = vec![0; CHUNK];
+        let mut size = 0;
+        loop {
+            let count = match content.read(&mut buffer) {
+                Ok(0) => break,
+                Ok(count) => count,
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
+                Err(error) => return Err(read_error(error)),
+            };
+            hasher.update(&buffer[..count]);
+            writer.write_all(&buffer[..count]).map_err(ArchiveError::Disk)?;
+            size += count as u64;
+            self.since += count as u64;
+            if self.since >= LOOK_EVERY_BYTES {
+                self.since = 0;
+                keep_free(self.folder, self.reserve).map_err(ArchiveError::Disk)?;
+            }
+        }
+        let file = writer.into_inner().map_err(|error| ArchiveError::Disk(error.into_error()))?;
+        file.sync_all().map_err(ArchiveError::Disk)?;
+        Ok(StagedFile { path, size, sha256: Digest(hasher.finalize().into()) })
     }
-    let file = writer.into_inner().map_err(|error| ArchiveError::Disk(error.into_error()))?;
-    file.sync_all().map_err(ArchiveError::Disk)?;
-    Ok(StagedFile { path, size, sha256: Digest(hasher.finalize().into()) })
+}
+
+/// A reader that gives no more than there is room for, where there is a bound; what is left then is zero.
+struct Metered<'a, R> {
+    inner: R,
+    room: &'a Cell<Option<u64>>,
+}
+
+impl<R: Read> Read for Metered<'_, R> {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        let Some(room) = self.room.get() else { return self.inner.read(buffer) };
+        let most = buffer.len().min(usize::try_from(room).unwrap_or(usize::MAX));
+        if most == 0 && !buffer.is_empty() {
+            return Err(io::Error::other("more than it may hold"));
+        }
+        let count = self.inner.read(&mut buffer[..most])?;
+        self.room.set(Some(room - count as u64));
+        Ok(count)
+    }
+}
+
+impl<R: Seek> Seek for Metered<'_, R> {
+    fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
+        self.inner.seek(to)
+    }
 }
 
 /// A reader that gives no more than is left.

@@ -1,13 +1,13 @@
 //! Whether a file holds what its name says.
 
-use super::{disk, shots};
+use super::disk;
+use super::shots::{self, Shots};
 use crate::config::Limits;
 use crate::http::error::{ApiError, Code};
 use crate::reconstruction::PhotoFacts;
 use crate::reconstruction::photo::{self, PhotoError};
 use crate::store::{Content, FileKind, SurveyPath};
 use serde::de::IgnoredAny;
-use std::collections::BTreeSet;
 use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::Path;
@@ -79,10 +79,10 @@ fn json(file: &Path, place: &SurveyPath, array: bool) -> Result<Option<Vec<Strin
         (_, false) => return Err(wrong("is no JSON object")),
     }
     if array {
-        let components: Result<Vec<shots::Component>, _> = serde_json::from_reader(open()?);
-        if let Ok(components) = components {
-            let names: BTreeSet<String> = components.into_iter().flat_map(|component| component.shots.0).collect();
-            return Ok(Some(names.into_iter().collect()));
+        match shots::read(open()?) {
+            Shots::Named(names) => return Ok(Some(names.into_iter().collect())),
+            Shots::TooMany => return Err(wrong(&format!("names more than {} images", shots::MAX_SHOTS))),
+            Shots::Unknown => {}
         }
     }
     let document: Result<IgnoredAny, _> = serde_json::from_reader(open()?);

@@ -9,11 +9,15 @@ use crate::http::error::{ApiError, Problem};
 use crate::http::extract::ApiPath;
 use crate::http::intake::{self, disk};
 use crate::plant::PlantId;
-use crate::store::{SurveyId, Upload, UploadId};
+use crate::store::{SurveyId, Upload, UploadId, keep_free};
 use axum::extract::State;
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use jiff::Timestamp;
+use std::collections::HashSet;
+use std::fs::File;
+use std::io::{self, Read};
+use std::path::{Path, PathBuf};
 use uuid::Uuid;
 
 /// Longest metadata that is kept.
@@ -21,6 +25,9 @@ const MAX_METADATA_BYTES: usize = 4096;
 
 /// Most parts of one file.
 const MAX_PARTS: usize = 1000;
+
+/// How much is put together before the disk is looked at again.
+const LOOK_EVERY_BYTES: u64 = 16 << 20;
 
 /// Begin an upload that may be resumed (tus 1.0)
 ///
@@ -93,13 +100,11 @@ async fn create_upload(
     let id = UploadId(Uuid::new_v4());
     let file = state.blobs.upload_file(id);
     let sources: Vec<_> = parts.iter().flatten().map(|part| state.blobs.upload_file(part.id)).collect();
-    let target = file.clone();
+    let (target, staging, reserve) = (file.clone(), state.blobs.staging().to_owned(), state.limits.disk_reserve);
     let put_together = tokio::task::spawn_blocking(move || {
-        let mut whole = std::fs::File::create_new(&target)?;
-        for source in sources {
-            std::io::copy(&mut std::fs::File::open(source)?, &mut whole)?;
-        }
-        whole.sync_all()
+        put_together(&sources, &target, || keep_free(&staging, reserve)).inspect_err(|_| {
+            let _ = std::fs::remove_file(&target);
+        })
     });
     put_together.await.map_err(|error| ApiError::internal(&error))?.map_err(|error| disk(&file, error))?;
     let upload = Upload {
@@ -124,15 +129,31 @@ async fn create_upload(
     Ok((StatusCode::CREATED, headers).into_response())
 }
 
-/// The parts of a file, all of which must be whole.
+/// Writes the bytes of files one after the other into a new one, as long as the disk has room.
+fn put_together(sources: &[PathBuf], target: &Path, has_room: impl Fn() -> io::Result<()>) -> io::Result<()> {
+    let mut whole = File::create_new(target)?;
+    for source in sources {
+        let mut source = File::open(source)?;
+        while {
+            has_room()?;
+            io::copy(&mut Read::by_ref(&mut source).take(LOOK_EVERY_BYTES), &mut whole)? > 0
+        } {}
+    }
+    whole.sync_all()
+}
+
+/// The parts of a file, all of which must be whole, and each of which is named once.
 async fn finished_parts(state: &AppState, survey: SurveyId, urls: &str) -> Result<Vec<Upload>, ApiError> {
-    let mut parts = Vec::new();
+    let (mut parts, mut named) = (Vec::new(), HashSet::new());
     for url in urls.split_ascii_whitespace() {
         let id = url.rsplit('/').next().and_then(|id| Uuid::try_parse(id).ok()).map(UploadId);
         let part =
             require_upload(state, survey, id.ok_or_else(|| wrong(format!("`{url}` is no upload's URL")))?).await?;
         if !part.partial || part.received < part.length {
             return Err(wrong(format!("{url} is no part that is whole")));
+        }
+        if !named.insert(part.id) {
+            return Err(wrong(format!("{url} is named twice")));
         }
         parts.push(part);
         if parts.len() > MAX_PARTS {
@@ -143,4 +164,28 @@ async fn finished_parts(state: &AppState, survey: SurveyId, urls: &str) -> Resul
         return Err(wrong("Upload-Concat names no parts"));
     }
     Ok(parts)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn parts_are_put_together_as_long_as_there_is_room() {
+        let folder = tempfile::tempdir().unwrap();
+        let parts = ["one", "two"].map(|name| folder.path().join(name));
+        for part in &parts {
+            std::fs::write(part, part.file_name().unwrap().as_encoded_bytes()).unwrap();
+        }
+        let whole = folder.path().join("whole");
+        put_together(&parts, &whole, || Ok(())).unwrap();
+        assert_eq!(std::fs::read(&whole).unwrap(), b"onetwo");
+        let looks = std::cell::Cell::new(0);
+        let full = || {
+            looks.set(looks.get() + 1);
+            if looks.get() > 2 { Err(io::ErrorKind::StorageFull.into()) } else { Ok(()) }
+        };
+        let error = put_together(&parts, &folder.path().join("other"), full).unwrap_err();
+        assert_eq!(error.kind(), io::ErrorKind::StorageFull);
+    }
 }
