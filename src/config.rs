@@ -144,6 +144,9 @@ pub struct RetentionArgs {
     /// longer.
     #[arg(long, env = "HELIOMAP_KEEP_REPLACED", default_value = "86400", value_parser = parse_seconds, value_name = "SECONDS")]
     pub keep_replaced: Duration,
+    /// Days for which the audit log is kept.
+    #[arg(long, env = "HELIOMAP_KEEP_AUDIT", default_value = "400", value_name = "DAYS", value_parser = clap::value_parser!(u32).range(1..=36_500))]
+    pub keep_audit: u32,
 }
 
 /// How jobs are run.

@@ -23,7 +23,7 @@ use heliomap::store::schema::Schema;
 use heliomap::store::{Blobs, PostgresStore, SqliteStore, Store, StoreError};
 use heliomap::telemetry::metrics::{self, Metrics, Scrape};
 use heliomap::webhooks::{Sender, SenderSettings};
-use jiff::Timestamp;
+use jiff::{SignedDuration, Timestamp};
 use object_store::aws::AmazonS3Builder;
 use std::path::Path;
 use std::sync::Arc;
@@ -178,10 +178,12 @@ fn send_messages(
 /// Deletes what is over, and bytes that nothing needs any more, beside what else the process does, until it stops.
 fn keep_tidy(args: &RetentionArgs, store: &Arc<dyn Store>, blobs: &Blobs, stop: &CancellationToken) {
     let (store, blobs, stop, kept) = (store.clone(), blobs.clone(), stop.clone(), args.keep_replaced);
+    let audited = SignedDuration::from_hours(24 * i64::from(args.keep_audit));
     tokio::spawn(async move {
         loop {
             let tidied = async {
                 forget_what_is_over(&*store, &blobs).await?;
+                store.forget_audit(Timestamp::now() - audited).await?;
                 free_unused(&*store, &blobs, Timestamp::now().checked_sub(kept).unwrap_or(Timestamp::MIN)).await
             };
             match tidied.await {

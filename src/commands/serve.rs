@@ -48,7 +48,7 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
             insecure: args.insecure,
             ..AppState::new(store.clone(), blobs.clone(), args.limits.clone())
         };
-        let (metrics, bell) = (state.metrics.clone(), state.bell.clone());
+        let (metrics, bell, answering) = (state.metrics.clone(), state.bell.clone(), state.answering.clone());
         let scrape = Scrape { metrics: metrics.clone(), store: store.clone(), blobs: blobs.clone() };
         let sending = send_messages(&args.webhooks, &store, &metrics, &stop);
         keep_tidy(&args.retention, &store, &blobs, &stop);
@@ -72,6 +72,8 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
         stop.cancelled().await;
         let ending = async {
             serving.await?;
+            answering.close();
+            answering.wait().await;
             sending.await?;
             if let Some(working) = working {
                 working.await?;

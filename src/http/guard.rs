@@ -18,6 +18,7 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::net::IpAddr;
 use std::sync::Arc;
 use tower_http::request_id::RequestId;
+use tracing::Instrument;
 use utoipa::openapi::security::{HttpAuthScheme, HttpBuilder, SecurityScheme};
 use utoipa::openapi::{ContentBuilder, OpenApi, Ref, ResponseBuilder};
 use uuid::Uuid;
@@ -27,6 +28,9 @@ const SCHEME: &str = "key";
 
 /// How exact the time of a key's last use is.
 const LAST_USE_GRAIN: SignedDuration = SignedDuration::from_mins(1);
+
+/// How much of a request's path the audit log keeps, characters.
+const MAX_NOTED_PATH: usize = 500;
 
 /// Who sent a request.
 #[derive(Debug, Clone)]
@@ -200,26 +204,46 @@ pub async fn guard(
         key: caller.key.clone(),
         subject: caller.subject.clone(),
         method: request.method().to_string(),
-        path: request.uri().path().to_owned(),
+        path: noted_path(request.uri().path()),
         status: 0,
         request_id: request_id(&request).to_owned(),
     };
     let allowed = gate.allow(&caller, need, &parameters).await;
-    let refused = allowed.is_err();
-    let response = match allowed {
-        Ok(()) => {
-            request.extensions_mut().insert(caller);
-            next.run(request).await
+    let noted = changes || (allowed.is_err() && gate.state.rates.refusal(caller.counted));
+    let state = gate.state.clone();
+    let answer = async move {
+        let response = match allowed {
+            Ok(()) => {
+                request.extensions_mut().insert(caller);
+                next.run(request).await
+            }
+            Err(problem) => refuse(request, problem).await,
+        };
+        if noted {
+            entry.status = response.status().as_u16();
+            if let Err(error) = state.store.record(&entry).await {
+                tracing::error!(%error, ?entry, "the audit log cannot be written");
+            }
         }
-        Err(problem) => refuse(request, problem).await,
+        response
     };
-    if changes || refused {
-        entry.status = response.status().as_u16();
-        if let Err(error) = gate.state.store.record(&entry).await {
-            tracing::error!(%error, ?entry, "the audit log cannot be written");
-        }
+    if !changes {
+        return answer.await;
     }
-    response
+    // What began to change something comes to its end, and into the audit log, though the client hung up.
+    let answered = gate.state.answering.spawn(answer.in_current_span()).await;
+    answered.unwrap_or_else(|failure| match failure.try_into_panic() {
+        Ok(panic) => std::panic::resume_unwind(panic),
+        Err(failure) => ApiError::internal(&failure).into_response(),
+    })
+}
+
+/// The path of a request as the audit log keeps it: no longer than any that leads somewhere.
+fn noted_path(path: &str) -> String {
+    match path.char_indices().nth(MAX_NOTED_PATH) {
+        Some((end, _)) => format!("{}…", &path[..end]),
+        None => path.to_owned(),
+    }
 }
 
 impl Gate {

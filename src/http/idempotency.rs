@@ -15,12 +15,14 @@ use futures::StreamExt;
 use futures::stream::poll_fn;
 use jiff::{SignedDuration, Timestamp};
 use sha2::Digest as _;
+use std::convert::Infallible;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::task::Poll;
 use std::time::Duration;
 use utoipa::openapi::path::{ParameterBuilder, ParameterIn};
 use utoipa::openapi::schema::{ObjectBuilder, Type};
 use utoipa::openapi::{ContentBuilder, OpenApi, Ref, Required, ResponseBuilder};
+use uuid::Uuid;
 
 const HEADER: &str = "idempotency-key";
 /// Says that an answer is that of before.
@@ -81,8 +83,8 @@ async fn answer_once(
     request: Request,
     next: Next,
 ) -> Result<Response, ApiError> {
-    let now = Timestamp::now();
-    let begun = state.store.begin_request(organisation, key, now, now + TAKEN).await?;
+    let (now, token) = (Timestamp::now(), Uuid::new_v4());
+    let begun = state.store.begin_request(organisation, key, token, now, now + TAKEN).await?;
     let (parts, body) = request.into_parts();
     let told = Told::new(&parts.method, &parts.uri.to_string(), &parts.headers, body);
     match begun {
@@ -99,8 +101,12 @@ async fn answer_once(
         }
         Begun::New => {
             // Whatever becomes of it, a request that is not answered well gives its key back.
-            let taken = Taken { state: state.clone(), organisation, key: key.to_owned(), kept: false };
-            let response = next.run(Request::from_parts(parts, told.body())).await;
+            let taken = Taken { state: state.clone(), organisation, key: key.to_owned(), token, kept: false };
+            let renewing = taken.renew();
+            let response = tokio::select! {
+                response = next.run(Request::from_parts(parts, told.body())) => response,
+                never = renewing => match never {},
+            };
             keep(taken, told, response).await
         }
     }
@@ -111,15 +117,30 @@ struct Taken {
     state: AppState,
     organisation: OrganisationId,
     key: String,
+    token: Uuid,
     kept: bool,
+}
+
+impl Taken {
+    /// Keeps the key for as long as it is polled: a large upload takes its time.
+    async fn renew(&self) -> Infallible {
+        loop {
+            tokio::time::sleep(TAKEN.unsigned_abs() / 4).await;
+            let until = Timestamp::now() + TAKEN;
+            if let Err(error) = self.state.store.renew_request(self.organisation, &self.key, self.token, until).await {
+                tracing::warn!(%error, "an idempotency key cannot be kept");
+            }
+        }
+    }
 }
 
 impl Drop for Taken {
     fn drop(&mut self) {
         if !self.kept {
-            let (state, organisation, key) = (self.state.clone(), self.organisation, std::mem::take(&mut self.key));
+            let (state, organisation, token) = (self.state.clone(), self.organisation, self.token);
+            let key = std::mem::take(&mut self.key);
             tokio::spawn(async move {
-                if let Err(error) = state.store.forget_request(organisation, &key).await {
+                if let Err(error) = state.store.forget_request(organisation, &key, token).await {
                     tracing::warn!(%error, "an idempotency key cannot be given back");
                 }
             });
@@ -146,7 +167,7 @@ async fn keep(mut taken: Taken, told: Told, response: Response) -> Result<Respon
         body: body.to_vec(),
     };
     let until = Timestamp::now() + KEPT;
-    taken.state.store.keep_answer(taken.organisation, &taken.key, &kept, until).await?;
+    taken.state.store.keep_answer(taken.organisation, &taken.key, taken.token, &kept, until).await?;
     taken.kept = true;
     Ok(Response::from_parts(parts, Body::from(body)))
 }

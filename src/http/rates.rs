@@ -1,4 +1,4 @@
-//! How often a caller may ask, and how often an address may fail to show a key that is good.
+//! How often a caller may ask, how often an address may fail to show a key that is good, and how many refusals are noted.
 
 use super::error::{ApiError, Code};
 use crate::config::Limits;
@@ -12,6 +12,8 @@ use std::sync::atomic::{AtomicU32, Ordering};
 
 /// After so many counts, keys and addresses that were not heard of for a while are forgotten.
 const FORGET_EVERY: u32 = 10_000;
+/// How many refused looks of a caller are noted in a minute.
+const REFUSALS_PER_MINUTE: NonZeroU32 = NonZeroU32::new(60).unwrap();
 
 /// Counts the requests of each key and the failures of each address in this process.
 pub struct Rates {
@@ -19,6 +21,7 @@ pub struct Rates {
     counted: AtomicU32,
     keys: DefaultKeyedRateLimiter<KeyId>,
     addresses: DefaultKeyedRateLimiter<IpAddr>,
+    refusals: DefaultKeyedRateLimiter<KeyId>,
 }
 
 impl Rates {
@@ -32,7 +35,13 @@ impl Rates {
             counted: AtomicU32::new(0),
             keys: RateLimiter::keyed(Quota::per_second(per_second).allow_burst(burst)),
             addresses: RateLimiter::keyed(Quota::per_minute(at_least_one(limits.max_failed_logins_per_minute))),
+            refusals: RateLimiter::keyed(Quota::per_minute(REFUSALS_PER_MINUTE)),
         }
+    }
+
+    /// Counts a refused look of a caller; whether it is to be noted: who is refused without end fills no disk.
+    pub fn refusal(&self, key: Option<KeyId>) -> bool {
+        key.is_none_or(|key| self.count(&self.refusals, key, "refused too often").is_ok())
     }
 
     /// Counts a request of a caller; a problem where there were too many.
@@ -54,6 +63,7 @@ impl Rates {
         if self.counted.fetch_add(1, Ordering::Relaxed) % FORGET_EVERY == FORGET_EVERY - 1 {
             self.keys.retain_recent();
             self.addresses.retain_recent();
+            self.refusals.retain_recent();
         }
         rates.check_key(&who).map_err(|until| {
             let wait = until.wait_time_from(self.clock.now());

@@ -13,6 +13,7 @@ use crate::webhooks::Targets;
 use std::sync::Arc;
 use tokio::sync::{Notify, Semaphore};
 use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
 
 /// What every handler may use.
 #[derive(Clone)]
@@ -28,6 +29,8 @@ pub struct AppState {
     pub decoding: Arc<Semaphore>,
     /// Rung when a job was queued.
     pub bell: Arc<Notify>,
+    /// Requests that change something, until they have.
+    pub answering: TaskTracker,
     /// Raised when the service stops: answers without an end end then.
     pub stop: CancellationToken,
     /// Checks tokens of an identity provider, where there is one.
@@ -59,6 +62,7 @@ impl AppState {
             desk: Arc::default(),
             decoding: decoders(),
             bell: Arc::default(),
+            answering: TaskTracker::new(),
             stop: CancellationToken::new(),
             oidc: None,
             targets: Targets::Public,

@@ -186,6 +186,8 @@ pub trait AccessStore: Send + Sync + 'static {
 
     /// Adds to the audit log.
     async fn record(&self, entry: &AuditEntry) -> Result<(), StoreError>;
+    /// Forgets what the audit log holds of before a time.
+    async fn forget_audit(&self, before: Timestamp) -> Result<(), StoreError>;
     /// An organisation's audit log of a time, the newest first, each entry with its sequence number.
     async fn audit(
         &self,

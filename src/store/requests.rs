@@ -2,6 +2,7 @@
 
 use super::{Digest, OrganisationId, StoreError};
 use jiff::Timestamp;
+use uuid::Uuid;
 
 /// A request that was answered.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -28,24 +29,34 @@ pub enum Begun {
 /// Requests by the names that their clients gave them, each organisation's its own.
 #[async_trait::async_trait]
 pub trait RequestStore: Send + Sync + 'static {
-    /// Takes a name until a time, unless it is taken already.
+    /// Takes a name until a time, unless it is taken already; `token` is whoever takes it.
     async fn begin_request(
         &self,
         organisation: OrganisationId,
         name: &str,
+        token: Uuid,
         now: Timestamp,
         until: Timestamp,
     ) -> Result<Begun, StoreError>;
-    /// Keeps the answer to the request of that name until a time.
+    /// Keeps a name until another time, for whoever took it last.
+    async fn renew_request(
+        &self,
+        organisation: OrganisationId,
+        name: &str,
+        token: Uuid,
+        until: Timestamp,
+    ) -> Result<(), StoreError>;
+    /// Keeps the answer to the request of that name until a time, of whoever took it last.
     async fn keep_answer(
         &self,
         organisation: OrganisationId,
         name: &str,
+        token: Uuid,
         answer: &KeptAnswer,
         until: Timestamp,
     ) -> Result<(), StoreError>;
-    /// Gives a name back.
-    async fn forget_request(&self, organisation: OrganisationId, name: &str) -> Result<(), StoreError>;
+    /// Gives a name back, where no answer is kept, for whoever took it last.
+    async fn forget_request(&self, organisation: OrganisationId, name: &str, token: Uuid) -> Result<(), StoreError>;
     /// Forgets what was kept long enough.
     async fn forget_old_requests(&self, now: Timestamp) -> Result<(), StoreError>;
 }

@@ -154,6 +154,7 @@ pub const KEY_USED: &str = "UPDATE api_keys SET last_used_ms = $2 WHERE id = $1"
 pub const RECORD: &str = "\
     INSERT INTO audit (organisation_id, at_ms, key_id, key_name, method, path, status, request_id, subject) \
     VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9)";
+pub const FORGET_AUDIT: &str = "DELETE FROM audit WHERE at_ms < $1";
 pub const AUDIT: &str = "\
     SELECT seq, organisation_id, at_ms, key_id, key_name, method, path, status, request_id, subject FROM audit \
     WHERE organisation_id = $1 AND seq < $2 AND at_ms >= $4 AND at_ms < $5 ORDER BY seq DESC LIMIT $3";
@@ -240,15 +241,18 @@ pub const UPLOADS: &str = "SELECT id FROM uploads";
 
 /// Takes a name that nobody has, or whose time is over.
 pub const BEGIN_REQUEST: &str = "\
-    INSERT INTO requests (organisation_id, name, expires_ms) VALUES ($1, $2, $4) \
+    INSERT INTO requests (organisation_id, name, expires_ms, token) VALUES ($1, $2, $4, $5) \
     ON CONFLICT (organisation_id, name) DO UPDATE SET fingerprint = NULL, status = NULL, headers = NULL, body = NULL, \
-    expires_ms = excluded.expires_ms WHERE requests.expires_ms <= $3";
+    expires_ms = excluded.expires_ms, token = excluded.token WHERE requests.expires_ms <= $3";
+pub const RENEW_REQUEST: &str =
+    "UPDATE requests SET expires_ms = $4 WHERE organisation_id = $1 AND name = $2 AND token = $3 AND status IS NULL";
 pub const REQUEST: &str =
     "SELECT fingerprint, status, headers, body FROM requests WHERE organisation_id = $1 AND name = $2";
 pub const KEEP_ANSWER: &str = "\
     UPDATE requests SET fingerprint = $3, status = $4, headers = $5, body = $6, expires_ms = $7 \
-    WHERE organisation_id = $1 AND name = $2";
-pub const FORGET_REQUEST: &str = "DELETE FROM requests WHERE organisation_id = $1 AND name = $2 AND status IS NULL";
+    WHERE organisation_id = $1 AND name = $2 AND token = $8";
+pub const FORGET_REQUEST: &str =
+    "DELETE FROM requests WHERE organisation_id = $1 AND name = $2 AND token = $3 AND status IS NULL";
 pub const FORGET_OLD_REQUESTS: &str = "DELETE FROM requests WHERE expires_ms <= $1";
 
 pub const COUNT_WEBHOOKS: &str = "SELECT COUNT(*) FROM webhooks WHERE organisation_id = $1";

@@ -2,6 +2,9 @@ use crate::app::{App, assert_problem, json_of, plant_path};
 use heliomap::store::Scope;
 use reqwest::{Method, StatusCode};
 use serde_json::{Value, json};
+use std::time::Duration;
+use tokio::io::AsyncWriteExt;
+use tokio::net::TcpStream;
 
 async fn keyed() -> App {
     let mut app = App::with_keys().await;
@@ -131,4 +134,86 @@ async fn the_audit_log_tells_who_did_what() {
         ]
     );
     assert_eq!(log["items"][0]["request_id"], "call-7");
+}
+
+/// Sends a request and hangs up after a while, without waiting for the answer.
+async fn hang_up(app: &App, request: String, after: Duration) {
+    let mut socket = TcpStream::connect(app.base.trim_start_matches("http://")).await.unwrap();
+    socket.write_all(request.as_bytes()).await.unwrap();
+    tokio::time::sleep(after).await;
+}
+
+#[tokio::test]
+async fn what_is_done_is_noted_though_the_client_hung_up() {
+    let app = keyed().await;
+    let secret = app.secret.clone().unwrap();
+    let mut plants = Vec::new();
+    for number in 0..16 {
+        let (_, plant) = app.post("/api/v1/plants", json!({"name": format!("plant {number}")})).await;
+        plants.push(format!("/api/v1/plants/{}", plant["id"].as_str().unwrap()));
+    }
+    for (number, plant) in (0..).zip(&plants) {
+        let request = format!("DELETE {plant} HTTP/1.1\r\nhost: x\r\nauthorization: Bearer {secret}\r\n\r\n");
+        hang_up(&app, request, Duration::from_micros(400 * number)).await;
+    }
+    // What has begun comes to its end: the log is whole once no plant goes any more.
+    let mut seen = (usize::MAX, usize::MAX);
+    for _ in 0..100 {
+        let (_, log) = app.get("/api/v1/audit").await;
+        let noted = log["items"].as_array().unwrap().iter().filter(|entry| entry["method"] == "DELETE").count();
+        let (_, left) = app.get("/api/v1/plants").await;
+        let now = (noted, plants.len() - left["items"].as_array().unwrap().len());
+        let settled = now == seen && now.0 == now.1;
+        seen = now;
+        if settled {
+            break;
+        }
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    }
+    assert_eq!(seen.0, seen.1, "entries, and plants that are gone");
+    assert!(seen.0 > 0, "some were deleted");
+}
+
+#[tokio::test]
+async fn a_retry_after_a_lost_answer_is_answered_the_same() {
+    let app = keyed().await;
+    let secret = app.secret.clone().unwrap();
+    for number in 0..16 {
+        let body = format!("{{\"name\": \"plant {number}\"}}");
+        let request = format!(
+            "POST /api/v1/plants HTTP/1.1\r\nhost: x\r\nauthorization: Bearer {secret}\r\nidempotency-key: {number}\r\n\
+             content-type: application/json\r\ncontent-length: {}\r\n\r\n{body}",
+            body.len()
+        );
+        hang_up(&app, request, Duration::from_micros(400 * number)).await;
+        let status = loop {
+            let retry = app.request(Method::POST, "/api/v1/plants").header("idempotency-key", number.to_string());
+            let retry = retry.header("content-type", "application/json").body(body.clone()).send().await.unwrap();
+            if retry.status() != StatusCode::CONFLICT {
+                break retry.status();
+            }
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        };
+        // Without the answer that was kept it would be 200: the plant is there.
+        assert_eq!(status, StatusCode::CREATED, "{number}");
+    }
+}
+
+#[tokio::test]
+async fn refusals_without_end_do_not_fill_the_disk() {
+    let mut app = keyed().await;
+    let admin = app.secret.clone();
+    let (secret, _) = secret_of(&app, json!({"name": "dashboard", "scopes": ["read"]})).await;
+    app.secret = Some(secret);
+    let long = format!("/api/v1/plants/{}/modules/{}", uuid::Uuid::nil(), "x".repeat(60_000));
+    for _ in 0..100 {
+        assert_eq!(app.get(&long).await.0, StatusCode::NOT_FOUND);
+    }
+    app.secret = admin;
+    let (_, log) = app.get("/api/v1/audit?limit=1000").await;
+    let paths: Vec<&str> =
+        log["items"].as_array().unwrap().iter().map(|entry| entry["path"].as_str().unwrap()).collect();
+    let refused: Vec<&&str> = paths.iter().filter(|path| path.contains("/modules/")).collect();
+    assert!((60..70).contains(&refused.len()), "{}", refused.len());
+    assert!(refused.iter().all(|path| path.chars().count() == 501 && path.ends_with('…')));
 }

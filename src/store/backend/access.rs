@@ -138,6 +138,11 @@ impl AccessStore for Rows {
         Ok(())
     }
 
+    async fn forget_audit(&self, before: Timestamp) -> Result<(), StoreError> {
+        sqlx::query(sql::FORGET_AUDIT).bind(before.as_millisecond()).execute(&self.write).await?;
+        Ok(())
+    }
+
     async fn audit(
         &self,
         organisation: OrganisationId,

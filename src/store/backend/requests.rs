@@ -6,6 +6,7 @@ use crate::store::requests::{Begun, KeptAnswer, RequestStore};
 use crate::store::{OrganisationId, StoreError, sql};
 use async_trait::async_trait;
 use jiff::Timestamp;
+use uuid::Uuid;
 
 #[async_trait]
 impl RequestStore for Rows {
@@ -13,6 +14,7 @@ impl RequestStore for Rows {
         &self,
         organisation: OrganisationId,
         name: &str,
+        token: Uuid,
         now: Timestamp,
         until: Timestamp,
     ) -> Result<Begun, StoreError> {
@@ -22,6 +24,7 @@ impl RequestStore for Rows {
             .bind(name)
             .bind(now.as_millisecond())
             .bind(until.as_millisecond())
+            .bind(token.to_string())
             .execute(&mut *tx)
             .await?;
         let begun = match taken.rows_affected() {
@@ -36,10 +39,28 @@ impl RequestStore for Rows {
         Ok(begun)
     }
 
+    async fn renew_request(
+        &self,
+        organisation: OrganisationId,
+        name: &str,
+        token: Uuid,
+        until: Timestamp,
+    ) -> Result<(), StoreError> {
+        sqlx::query(sql::RENEW_REQUEST)
+            .bind(organisation.to_string())
+            .bind(name)
+            .bind(token.to_string())
+            .bind(until.as_millisecond())
+            .execute(&self.write)
+            .await?;
+        Ok(())
+    }
+
     async fn keep_answer(
         &self,
         organisation: OrganisationId,
         name: &str,
+        token: Uuid,
         answer: &KeptAnswer,
         until: Timestamp,
     ) -> Result<(), StoreError> {
@@ -51,13 +72,15 @@ impl RequestStore for Rows {
             .bind(&answer.headers)
             .bind(&answer.body)
             .bind(until.as_millisecond())
+            .bind(token.to_string())
             .execute(&self.write)
             .await?;
         Ok(())
     }
 
-    async fn forget_request(&self, organisation: OrganisationId, name: &str) -> Result<(), StoreError> {
-        sqlx::query(sql::FORGET_REQUEST).bind(organisation.to_string()).bind(name).execute(&self.write).await?;
+    async fn forget_request(&self, organisation: OrganisationId, name: &str, token: Uuid) -> Result<(), StoreError> {
+        let query = sqlx::query(sql::FORGET_REQUEST).bind(organisation.to_string()).bind(name);
+        query.bind(token.to_string()).execute(&self.write).await?;
         Ok(())
     }
 

@@ -113,25 +113,37 @@ pub async fn audit_log(store: &dyn Store) {
     assert_eq!((&log[0].1.subject, log[1].1.subject.as_deref()), (&None, Some("pilot-7")));
     let rest = store.audit(a, TimeSpan::default(), Page { after: Some(log[0].0), limit: 9 }).await.unwrap();
     assert_eq!(rest.len(), 1);
+    store.forget_audit(at(3)).await.unwrap();
+    assert_eq!(store.audit(a, TimeSpan::default(), ALL).await.unwrap().len(), 1);
+    assert!(store.audit(b, TimeSpan::default(), ALL).await.unwrap().is_empty());
 }
 
 pub async fn named_requests(store: &dyn Store) {
     let (a, b) = (organisation(store, "A").await, organisation(store, "B").await);
-    let begin =
-        async |organisation, now| store.begin_request(organisation, "one", at(now), at(now + 60)).await.unwrap();
-    assert_eq!(begin(a, 0).await, Begun::New);
-    assert_eq!(begin(a, 59).await, Begun::Running);
-    assert_eq!(begin(b, 0).await, Begun::New, "names are each organisation's own");
-    // Whoever had it died over it.
-    assert_eq!(begin(a, 60).await, Begun::New);
+    let [first, second] = [Uuid::from_u128(1), Uuid::from_u128(2)];
+    let begin = async |organisation, token, now| {
+        store.begin_request(organisation, "one", token, at(now), at(now + 60)).await.unwrap()
+    };
+    assert_eq!(begin(a, first, 0).await, Begun::New);
+    assert_eq!(begin(a, second, 59).await, Begun::Running);
+    assert_eq!(begin(b, second, 0).await, Begun::New, "names are each organisation's own");
+    // It takes its time.
+    store.renew_request(a, "one", first, at(100)).await.unwrap();
+    assert_eq!(begin(a, second, 99).await, Begun::Running);
+    // Whoever had it died over it, or slept: it is another's now.
+    assert_eq!(begin(a, second, 100).await, Begun::New);
     let answer =
         KeptAnswer { fingerprint: Digest::of(b"x"), status: 201, headers: "{}".to_owned(), body: vec![0, 159, 255] };
-    store.keep_answer(a, "one", &answer, at(1000)).await.unwrap();
-    assert_eq!(begin(a, 200).await, Begun::Answered(Box::new(answer.clone())));
-    store.forget_request(a, "one").await.unwrap();
-    assert_eq!(begin(a, 200).await, Begun::Answered(Box::new(answer)), "what was answered stays");
-    store.forget_request(b, "one").await.unwrap();
-    assert_eq!(begin(b, 1).await, Begun::New);
+    store.renew_request(a, "one", first, at(1000)).await.unwrap();
+    store.keep_answer(a, "one", first, &answer, at(1000)).await.unwrap();
+    store.forget_request(a, "one", first).await.unwrap();
+    assert_eq!(begin(a, first, 101).await, Begun::Running);
+    store.keep_answer(a, "one", second, &answer, at(1000)).await.unwrap();
+    assert_eq!(begin(a, first, 200).await, Begun::Answered(Box::new(answer.clone())));
+    store.forget_request(a, "one", second).await.unwrap();
+    assert_eq!(begin(a, first, 200).await, Begun::Answered(Box::new(answer)), "what was answered stays");
+    store.forget_request(b, "one", second).await.unwrap();
+    assert_eq!(begin(b, first, 1).await, Begun::New);
     store.forget_old_requests(at(1000)).await.unwrap();
-    assert_eq!(begin(a, 999).await, Begun::New);
+    assert_eq!(begin(a, first, 999).await, Begun::New);
 }
