@@ -16,6 +16,7 @@ use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
+use tower::{Layer, ServiceExt};
 use tower_http::CompressionLevel;
 use tower_http::catch_panic::CatchPanicLayer;
 use tower_http::compression::CompressionLayer;
@@ -137,7 +138,7 @@ pub fn router(state: AppState) -> Router {
         .layer(CompressionLayer::new().quality(CompressionLevel::Fastest))
         .layer(middleware::from_fn(encoding::acceptable))
         .layer(middleware::map_response(as_it_says))
-        .layer(tower::util::option_layer(cors))
+        .layer(tower::util::option_layer(cors.map(|layer| middleware::from_fn_with_state(layer, cross_origin))))
         .layer(PropagateRequestIdLayer::new(REQUEST_ID))
         .layer(TraceLayer::new_for_http().make_span_with(span).on_response(log_response).on_failure(()))
         .layer(SetRequestIdLayer::new(REQUEST_ID, MakeRequestUuid))
@@ -150,9 +151,13 @@ fn cors(network: &NetworkArgs) -> Option<CorsLayer> {
     let headers = headers.into_iter().chain(["idempotency-key", "tus-resumable", "upload-checksum", "upload-concat"]);
     let headers =
         headers.chain(["upload-length", "upload-metadata", "upload-offset", "x-http-method-override", "traceparent"]);
-    let exposed = ["etag", "link", "location", "retry-after", "tus-extension", "tus-max-size", "tus-resumable"];
-    let exposed = exposed.into_iter().chain(["tus-version", "upload-expires", "upload-offset", "x-request-id"]);
-    let methods = [Method::GET, Method::HEAD, Method::POST, Method::PUT, Method::PATCH, Method::DELETE];
+    let exposed = ["etag", "idempotency-replayed", "link", "location", "retry-after", "x-request-id"];
+    let exposed =
+        exposed.into_iter().chain(["tus-checksum-algorithm", "tus-extension", "tus-max-size", "tus-resumable"]);
+    let exposed = exposed.chain(["tus-version", "upload-concat", "upload-expires", "upload-length", "upload-metadata"]);
+    let exposed = exposed.chain(["upload-offset"]);
+    let methods =
+        [Method::GET, Method::HEAD, Method::POST, Method::PUT, Method::PATCH, Method::DELETE, Method::OPTIONS];
     (!network.cors_origin.is_empty()).then(|| {
         CorsLayer::new()
             .allow_origin(network.cors_origin.clone())
@@ -161,6 +166,23 @@ fn cors(network: &NetworkArgs) -> Option<CorsLayer> {
             .expose_headers(exposed.map(HeaderName::from_static).collect::<Vec<_>>())
             .max_age(Duration::from_secs(3600))
     })
+}
+
+/// Answers what a browser asks before a script's request. Other requests for the options of a resource are answered by it:
+/// the layer, which takes each of them for such a question, is shown another method.
+async fn cross_origin(State(layer): State<CorsLayer>, mut request: Request, next: Next) -> Response {
+    let preflight = request.headers().contains_key(header::ACCESS_CONTROL_REQUEST_METHOD);
+    let options = *request.method() == Method::OPTIONS && !preflight;
+    if options {
+        *request.method_mut() = Method::GET;
+    }
+    let inner = next.map_request(move |mut request: Request| {
+        if options {
+            *request.method_mut() = Method::OPTIONS;
+        }
+        request
+    });
+    layer.layer(inner).oneshot(request).await.unwrap_or_else(|never| match never {})
 }
 
 /// What is answered is what its type says, whatever it looks like to a browser.

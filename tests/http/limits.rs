@@ -118,6 +118,25 @@ async fn scripts_of_other_pages_get_in_where_that_is_configured() {
     assert_eq!(answer.headers()["access-control-allow-origin"], origin);
     assert!(answer.headers()["access-control-expose-headers"].to_str().unwrap().contains("upload-offset"));
 
+    // What a resumable upload is asked for reaches scripts, and its options are its own.
+    let survey = app.survey().await;
+    let uploads = format!("{survey}/uploads");
+    for from in [None, Some(origin)] {
+        let request = app.request(Method::OPTIONS, &uploads);
+        let request = from.into_iter().fold(request, |request, from| request.header("origin", from));
+        let options = request.send().await.unwrap();
+        assert_eq!(
+            (options.status(), &options.headers()["tus-version"]),
+            (StatusCode::NO_CONTENT, &"1.0.0".parse().unwrap())
+        );
+        assert_eq!(options.headers().get("access-control-allow-origin").is_some(), from.is_some());
+    }
+    let exposed = answer.headers()["access-control-expose-headers"].to_str().unwrap().to_owned();
+    for name in ["upload-length", "upload-metadata", "upload-concat", "tus-checksum-algorithm", "idempotency-replayed"]
+    {
+        assert!(exposed.split(',').any(|known| known == name), "{name} is not in {exposed}");
+    }
+
     let closed = App::new(&[]).await;
     let answer = closed.request(Method::GET, "/api/v1/plants").header("origin", origin).send().await.unwrap();
     assert!(!answer.headers().contains_key("access-control-allow-origin"));
