@@ -45,6 +45,9 @@ pub struct Limits {
     /// Most connections at once; more wait.
     #[arg(long, env = "HELIOMAP_MAX_CONNECTIONS", default_value_t = 1024, value_name = "COUNT")]
     pub max_connections: usize,
+    /// Most unfinished resumable uploads of an organisation.
+    #[arg(long, env = "HELIOMAP_MAX_UPLOADS", default_value_t = 10_000, value_name = "COUNT")]
+    pub max_uploads: u64,
     /// Free space of the data folder's disk that uploads leave to running jobs.
     #[arg(long, env = "HELIOMAP_DISK_RESERVE", default_value = "1G", value_parser = parse_size, value_name = "SIZE")]
     pub disk_reserve: u64,
@@ -80,6 +83,7 @@ impl Default for Limits {
             max_requests_per_second: 300,
             max_failed_logins_per_minute: 300,
             max_connections: 1024,
+            max_uploads: 10_000,
             disk_reserve: 1 << 30,
             quota_bytes: None,
             quota_plants: None,

@@ -7,19 +7,28 @@ use super::error::{ApiError, Code};
 use super::guard::{Caller, refuse};
 use super::usage;
 use crate::config::Limits;
+use crate::plant::PlantId;
+use crate::store::{ImageName, SurveyId, SurveyPath};
 use axum::body::Body;
-use axum::extract::{Request, State};
+use axum::extract::{MatchedPath, RawPathParams, Request, State};
 use axum::http::{HeaderMap, Method, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use futures::StreamExt;
 use std::sync::{Arc, OnceLock};
+use uuid::Uuid;
 
 /// How much of an upload comes before the disk is looked at again. Many uploads at once stay within the reserve.
 const LOOK_EVERY_BYTES: u64 = 16 << 20;
 
 /// Lets an upload through, or says why not.
-pub async fn admit(State(state): State<AppState>, request: Request, next: Next) -> Response {
+pub async fn admit(
+    State(state): State<AppState>,
+    path: MatchedPath,
+    parameters: RawPathParams,
+    request: Request,
+    next: Next,
+) -> Response {
     if !matches!(*request.method(), Method::PUT | Method::POST | Method::PATCH) {
         return next.run(request).await;
     }
@@ -27,11 +36,13 @@ pub async fn admit(State(state): State<AppState>, request: Request, next: Next) 
         return refuse(request, problem).await;
     }
     let bytes = announced(request.headers(), &state.limits);
-    // What goes on with an upload was counted when it began.
-    let begins = !request.headers().contains_key("upload-offset");
-    let organisation = request.extensions().get::<Caller>().map(|caller| caller.organisation).filter(|_| begins);
+    // What a resumable upload brings is counted as one with its beginning.
+    let resumable = path.as_str().contains("/uploads");
+    let organisation = request.extensions().get::<Caller>().map(|caller| caller.organisation).filter(|_| !resumable);
     let room = match (room_on_disk(&state, bytes), organisation) {
-        (Ok(()), Some(organisation)) => usage::room(&state, organisation, bytes).await,
+        (Ok(()), Some(organisation)) => {
+            usage::room(&state, organisation, bytes, may_be_there(&state, &parameters, bytes)).await
+        }
         (Ok(()), None) => Ok(None),
         (Err(problem), _) => Err(problem),
     };
@@ -57,6 +68,25 @@ fn announced(headers: &HeaderMap, limits: &Limits) -> u64 {
     let announced = number("upload-length").or_else(|| number(header::CONTENT_LENGTH.as_str()));
     let largest = limits.max_archive_size.max(limits.max_file_size).max(limits.max_image_size);
     announced.filter(|bytes| *bytes <= largest).unwrap_or(0)
+}
+
+/// Whether so many bytes, 0 where that is not known, may be in the survey already: storing them tells whether they count.
+async fn may_be_there(state: &AppState, parameters: &RawPathParams, bytes: u64) -> Result<bool, ApiError> {
+    let parameter = |name: &str| parameters.iter().find(|(known, _)| *known == name).map(|(_, value)| value);
+    let id = |name: &str| parameter(name).and_then(|value| Uuid::try_parse(value).ok());
+    let (Some(plant), Some(survey)) = (id("plant").map(PlantId), id("survey").map(SurveyId)) else {
+        return Ok(false);
+    };
+    if state.store.survey(plant, survey).await?.is_none() {
+        return Ok(false);
+    }
+    let place = match (parameter("name"), parameter("path")) {
+        (Some(name), _) => ImageName::parse(name).map(|name| SurveyPath::of_image(&name)),
+        (None, Some(path)) => SurveyPath::of_reconstruction(path),
+        (None, None) => return Ok(!state.store.files(survey).await?.is_empty()),
+    };
+    let Ok(place) = place else { return Ok(false) };
+    Ok(state.store.file(survey, &place).await?.is_some_and(|file| bytes == 0 || file.size == bytes))
 }
 
 fn room_on_disk(state: &AppState, bytes: u64) -> Result<(), ApiError> {

@@ -85,6 +85,7 @@ codes! {
     ArchiveUnreadable = UNPROCESSABLE_ENTITY, "archive_unreadable", "The archive cannot be read";
     ArchiveEmpty = UNPROCESSABLE_ENTITY, "archive_empty", "The archive holds no file of a survey";
     TooManyRequests = TOO_MANY_REQUESTS, "too_many_requests", "Too many requests";
+    TooManyUploads = TOO_MANY_REQUESTS, "too_many_uploads", "There are as many unfinished uploads as there may be";
     Internal = INTERNAL_SERVER_ERROR, "internal_error", "The service failed";
     Unavailable = SERVICE_UNAVAILABLE, "unavailable", "The service is not ready";
     QuotaExceeded = INSUFFICIENT_STORAGE, "quota_exceeded", "The organisation may not keep so much";
@@ -170,6 +171,14 @@ impl From<StoreError> for ApiError {
         match &error {
             StoreError::Gone { what: "plant" } => Self::new(Code::PlantNotFound, "the plant was deleted meanwhile"),
             StoreError::OverQuota { what, used, quota } => super::usage::over_quota(what, *used, *quota),
+            StoreError::TooManyUploads { open, most } => Self::new(
+                Code::TooManyUploads,
+                format!(
+                    "the organisation has {open} unfinished uploads of the {most} that it may have at once: go on with some of \
+                     them or end them, `GET` of a survey's uploads with `state=unfinished` lists them; else they end by themselves"
+                ),
+            )
+            .retry_after(60),
             StoreError::BeingFreed { .. } => Self::new(
                 Code::Unavailable,
                 "the same bytes were replaced before and are just being deleted; send the request again",

@@ -34,14 +34,25 @@ async fn usage_of(state: &AppState, organisation: OrganisationId) -> Result<(Usa
     Ok((usage, Quotas { bytes: bounded(quotas.bytes), plants: bounded(quotas.plants) }))
 }
 
-/// How many bytes an organisation may still send; `None` where there is no bound.
+/// How many bytes an organisation may still send; `None` where there is no bound. Where they `may_be_there` already they may
+/// count for nothing: then as many may come as if nothing was kept.
 ///
 /// # Errors
 /// Where these do not fit.
-pub async fn room(state: &AppState, organisation: OrganisationId, bytes: u64) -> Result<Option<u64>, ApiError> {
+pub async fn room(
+    state: &AppState,
+    organisation: OrganisationId,
+    bytes: u64,
+    may_be_there: impl Future<Output = Result<bool, ApiError>>,
+) -> Result<Option<u64>, ApiError> {
     let (usage, quotas) = usage_of(state, organisation).await?;
     let Some(quota) = quotas.bytes else { return Ok(None) };
     let used = usage.bytes.saturating_add(usage.announced_bytes);
+    // What comes without a length may turn out to be too much.
+    let fits = bytes > 0 && used.saturating_add(bytes) <= quota;
+    if !fits && may_be_there.await? && bytes <= quota {
+        return Ok(Some(quota));
+    }
     match quota.checked_sub(used.saturating_add(bytes)) {
         Some(_) => Ok(Some(quota - used)),
         None => Err(over_quota("bytes", used, quota)),

@@ -37,7 +37,7 @@ pub use sqlite::SqliteStore;
 pub use survey_path::{Content, FileKind, ImageName, InvalidPath, SurveyPath};
 pub use tasks::{GivenBack, ImageTask, OwnTask, TaskClaim, TaskStore};
 
-pub use uploads::{Upload, UploadId, UploadStore};
+pub use uploads::{Upload, UploadBounds, UploadId, UploadStore};
 pub use usage::{Quotas, UnusedBlob, Usage, UsageStore};
 pub use webhooks::{
     Delivery, DeliveryClaim, DeliveryId, DeliveryState, NewWebhook, Sent, SigningSecret, Webhook, WebhookId,
@@ -61,6 +61,9 @@ pub enum StoreError {
     /// The organisation may not keep so much.
     #[error("the organisation keeps {used} of the {quota} {what} that it may keep")]
     OverQuota { what: &'static str, used: u64, quota: u64 },
+    /// The organisation has as many unfinished uploads as it may.
+    #[error("the organisation has {open} unfinished uploads, and may have {most}")]
+    TooManyUploads { open: u64, most: u64 },
     /// The database failed.
     #[error("database: {0}")]
     Database(#[from] sqlx::Error),

@@ -237,6 +237,12 @@ pub const UPLOAD_RECEIVED: &str = "UPDATE uploads SET received = $2, expires_ms 
 pub const END_UPLOAD: &str = "UPDATE uploads SET outcome = $2 WHERE id = $1";
 pub const DELETE_UPLOAD: &str = "DELETE FROM uploads WHERE survey_id = $1 AND id = $2";
 pub const DELETE_EXPIRED_UPLOADS: &str = "DELETE FROM uploads WHERE expires_ms <= $1";
+pub const OWNER_OF_SURVEY: &str =
+    "SELECT plants.organisation_id FROM surveys JOIN plants ON plants.id = surveys.plant_id WHERE surveys.id = $1";
+pub const ANNOUNCED_BY_ORGANISATION: &str = "\
+    SELECT COUNT(*) AS uploads, CAST(COALESCE(SUM(uploads.length), 0) AS BIGINT) AS bytes FROM uploads \
+    JOIN surveys ON surveys.id = uploads.survey_id JOIN plants ON plants.id = surveys.plant_id \
+    WHERE plants.organisation_id = $1 AND uploads.outcome IS NULL AND uploads.expires_ms > $2";
 pub const UPLOADS: &str = "SELECT id FROM uploads";
 
 /// Takes a name that nobody has, or whose time is over.

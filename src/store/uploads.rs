@@ -1,6 +1,7 @@
 //! Uploads that may be resumed.
 
 use super::records::row_id;
+use super::usage::Quotas;
 use super::{StoreError, SurveyId};
 use jiff::Timestamp;
 use std::fmt;
@@ -29,11 +30,29 @@ pub struct Upload {
     pub outcome: Option<String>,
 }
 
+/// What an upload that begins must keep to.
+#[derive(Debug, Clone, Copy)]
+pub struct UploadBounds {
+    /// What holds for what was not said of the organisation alone.
+    pub quotas: Quotas,
+    /// Most unfinished uploads of an organisation.
+    pub open: u64,
+    /// Whether its bytes may be in the survey already. Then they fit where they would if nothing was kept: storing them
+    /// tells whether they count.
+    pub may_be_there: bool,
+}
+
 /// Uploads that may be resumed.
 #[async_trait::async_trait]
 pub trait UploadStore: Send + Sync + 'static {
-    /// Notes an upload to come.
-    async fn create_upload(&self, upload: &Upload) -> Result<(), StoreError>;
+    /// Notes an upload to come, within bounds unless it was put together from others, which it replaces:
+    /// [`StoreError::OverQuota`] where what it announces does not fit, [`StoreError::TooManyUploads`] where there are too many.
+    async fn create_upload(
+        &self,
+        upload: &Upload,
+        bounds: Option<&UploadBounds>,
+        now: Timestamp,
+    ) -> Result<(), StoreError>;
     /// One upload to a survey, expired ones included.
     async fn upload(&self, survey: SurveyId, id: UploadId) -> Result<Option<Upload>, StoreError>;
     /// A survey's uploads that are not expired, in the order of their identifiers: at most `limit` of those after a text.

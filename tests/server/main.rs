@@ -192,7 +192,7 @@ fn uploads_whose_time_is_over_are_forgotten_while_the_service_runs() {
     let goes_on = upload(2, SignedDuration::from_hours(1));
     let file = |upload: &Upload| data.path().join("uploads").join(upload.id.to_string());
     for upload in [&over, &goes_on] {
-        runtime.block_on(store.create_upload(upload)).unwrap();
+        runtime.block_on(store.create_upload(upload, None, jiff::Timestamp::now())).unwrap();
         let made = std::fs::File::create(file(upload)).unwrap();
         made.set_modified(std::time::SystemTime::now() - Duration::from_secs(90_000)).unwrap();
     }

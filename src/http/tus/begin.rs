@@ -9,7 +9,7 @@ use crate::http::error::{ApiError, Problem};
 use crate::http::extract::ApiPath;
 use crate::http::intake::{self, disk};
 use crate::plant::PlantId;
-use crate::store::{SurveyId, Upload, UploadId, keep_free};
+use crate::store::{SurveyId, Upload, UploadBounds, UploadId, keep_free};
 use axum::extract::State;
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
@@ -51,7 +51,7 @@ const LOOK_EVERY_BYTES: u64 = 16 << 20;
         (status = 201, description = "Send its bytes to `location`", headers(("location" = String),
             ("upload-expires" = String))),
         (status = "4XX", description = "`plant_not_found`, `survey_not_found`, `upload_not_found` (a part), `tus_version`, \
-            `bad_request`, `invalid_name`, `unknown_file`, `too_large`; a file put together: as `PUT` of that file",
+            `bad_request`, `invalid_name`, `unknown_file`, `too_large`, `too_many_uploads`; a file put together: as `PUT` of that file",
             body = Problem, content_type = "application/problem+json"),
         (status = 507, description = "`storage_full`, `quota_exceeded`", body = Problem, content_type = "application/problem+json")
     )
@@ -87,16 +87,19 @@ async fn create_upload(
         Some(parts) => parts.iter().map(|part| part.length).sum(),
         None => number(headers, "upload-length")?,
     };
-    let (name, limit) = match partial {
-        true => ("the part".to_owned(), state.limits.max_archive_size.max(state.limits.max_file_size)),
-        false => {
-            let place = Place::of(metadata)?;
-            (place.name().to_owned(), place.max_bytes(state))
-        }
+    let whole = if partial { None } else { Some(Place::of(metadata)?) };
+    let (name, limit) = match &whole {
+        None => ("the part", state.limits.max_archive_size.max(state.limits.max_file_size)),
+        Some(place) => (place.name(), place.max_bytes(state)),
     };
     if length > limit {
-        return Err(intake::too_large(&name, limit));
+        return Err(intake::too_large(name, limit));
     }
+    let may_be_there = match &whole {
+        Some(place) if parts.is_none() => place.may_hold(state, survey, length).await?,
+        _ => false,
+    };
+    let bounds = UploadBounds { quotas: state.limits.quotas(), open: state.limits.max_uploads, may_be_there };
     let id = UploadId(Uuid::new_v4());
     let file = state.blobs.upload_file(id);
     let sources: Vec<_> = parts.iter().flatten().map(|part| state.blobs.upload_file(part.id)).collect();
@@ -117,7 +120,12 @@ async fn create_upload(
         expires: Timestamp::now() + LIFE,
         outcome: None,
     };
-    state.store.create_upload(&upload).await?;
+    // What its parts announced is counted already.
+    let bounds = parts.is_none().then_some(&bounds);
+    if let Err(error) = state.store.create_upload(&upload, bounds, Timestamp::now()).await {
+        remove(&file).await;
+        return Err(error.into());
+    }
     if upload.received == length {
         finish(state, plant, &upload).await?;
     }

@@ -3,7 +3,7 @@
 use super::protocol::wrong;
 use crate::http::AppState;
 use crate::http::error::ApiError;
-use crate::store::{Content, ImageName, SurveyPath};
+use crate::store::{Content, ImageName, SurveyId, SurveyPath};
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
 use std::collections::HashMap;
@@ -34,6 +34,14 @@ impl Place {
                 Err(wrong("Upload-Metadata must tell `filename` (of a photo) or `path` (in the survey's folder)"))
             }
         }
+    }
+
+    /// Whether so many bytes may be there already.
+    pub(super) async fn may_hold(&self, state: &AppState, survey: SurveyId, length: u64) -> Result<bool, ApiError> {
+        Ok(match self {
+            Self::File(path) => state.store.file(survey, path).await?.is_some_and(|file| file.size == length),
+            Self::Archive => !state.store.files(survey).await?.is_empty(),
+        })
     }
 
     /// As a client tells it.

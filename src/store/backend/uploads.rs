@@ -1,14 +1,25 @@
 //! Uploads that may be resumed.
 
-use super::super::Rows;
+use super::super::{Rows, Tx};
 use super::read;
-use crate::store::{StoreError, SurveyId, Upload, UploadId, UploadStore, sql};
+use super::usage::quotas;
+use crate::store::{StoreError, SurveyId, Upload, UploadBounds, UploadId, UploadStore, sql};
 use async_trait::async_trait;
 use jiff::Timestamp;
+use sqlx::Row as _;
 
 #[async_trait]
 impl UploadStore for Rows {
-    async fn create_upload(&self, upload: &Upload) -> Result<(), StoreError> {
+    async fn create_upload(
+        &self,
+        upload: &Upload,
+        bounds: Option<&UploadBounds>,
+        now: Timestamp,
+    ) -> Result<(), StoreError> {
+        let mut tx = self.begin().await?;
+        if let Some(bounds) = bounds {
+            require_within(&mut tx, upload, bounds, now).await?;
+        }
         sqlx::query(sql::CREATE_UPLOAD)
             .bind(upload.id.to_string())
             .bind(upload.survey.to_string())
@@ -17,9 +28,10 @@ impl UploadStore for Rows {
             .bind(upload.partial)
             .bind(&upload.metadata)
             .bind(upload.expires.as_millisecond())
-            .execute(&self.write)
+            .execute(&mut *tx)
             .await
             .map_err(super::gone("survey"))?;
+        tx.commit().await?;
         Ok(())
     }
 
@@ -67,4 +79,26 @@ impl UploadStore for Rows {
         let rows = sqlx::query(sql::UPLOADS).fetch_all(&self.read).await?;
         rows.iter().map(|row| Ok(UploadId(read::uuid(row, "id")?))).collect()
     }
+}
+
+/// Refuses an upload beyond its bounds. Until the transaction ends, no other of its organisation begins.
+async fn require_within(tx: &mut Tx, upload: &Upload, bounds: &UploadBounds, now: Timestamp) -> Result<(), StoreError> {
+    let owner: Option<String> =
+        sqlx::query_scalar(sql::OWNER_OF_SURVEY).bind(upload.survey.to_string()).fetch_optional(&mut **tx).await?;
+    let owner = owner.ok_or(StoreError::Gone { what: "survey" })?;
+    let quota = quotas(tx, &owner, bounds.quotas).await?.bytes;
+    let query = sqlx::query(sql::ANNOUNCED_BY_ORGANISATION).bind(&owner).bind(now.as_millisecond());
+    let row = query.fetch_one(&mut **tx).await?;
+    let (open, announced) = (row.try_get::<i64, _>("uploads")? as u64, row.try_get::<i64, _>("bytes")? as u64);
+    if open >= bounds.open {
+        return Err(StoreError::TooManyUploads { open, most: bounds.open });
+    }
+    let Some(quota) = quota else { return Ok(()) };
+    let kept = sqlx::query_scalar(sql::BYTES_OF_ORGANISATION).bind(&owner).fetch_one(&mut **tx).await;
+    let kept = kept.map(|bytes: i64| bytes as u64)?;
+    let counted = if bounds.may_be_there { 0 } else { kept };
+    if counted.saturating_add(announced).saturating_add(upload.length) > quota {
+        return Err(StoreError::OverQuota { what: "bytes", used: kept.saturating_add(announced), quota });
+    }
+    Ok(())
 }

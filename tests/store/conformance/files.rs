@@ -74,7 +74,7 @@ pub async fn uploads(store: &dyn Store) {
         expires: at(100),
         outcome: None,
     };
-    store.create_upload(&upload).await.unwrap();
+    store.create_upload(&upload, None, at(0)).await.unwrap();
     assert_eq!(store.upload(survey.id, id).await.unwrap(), Some(upload.clone()));
     assert_eq!(store.upload(SurveyId(Uuid::nil()), id).await.unwrap(), None);
     assert!(store.upload_received(id, 1 << 33, at(200)).await.unwrap());
@@ -85,7 +85,7 @@ pub async fn uploads(store: &dyn Store) {
     let ids = (1..=3).map(|number| UploadId(Uuid::from_u128(number << 64))).collect::<Vec<_>>();
     for (id, expires) in ids.iter().zip([150, 150, 100]) {
         let another = Upload { id: *id, received: 0, outcome: None, expires: at(expires), ..upload.clone() };
-        store.create_upload(&another).await.unwrap();
+        store.create_upload(&another, None, at(0)).await.unwrap();
     }
     let listed = async |after: String, limit, now| -> Vec<UploadId> {
         let found = store.uploads_of_survey(survey.id, &after, limit, at(now)).await.unwrap();
@@ -99,11 +99,11 @@ pub async fn uploads(store: &dyn Store) {
     assert_eq!(store.uploads().await.unwrap(), [id]);
     store.delete_expired_uploads(at(200)).await.unwrap();
     assert!(store.uploads().await.unwrap().is_empty());
-    store.create_upload(&upload).await.unwrap();
+    store.create_upload(&upload, None, at(0)).await.unwrap();
     assert!(!store.delete_upload(SurveyId(Uuid::nil()), id).await.unwrap());
     assert!(store.delete_upload(survey.id, id).await.unwrap());
     upload.survey = SurveyId(Uuid::nil());
-    assert!(matches!(store.create_upload(&upload).await, Err(StoreError::Gone { what: "survey" })));
+    assert!(matches!(store.create_upload(&upload, None, at(0)).await, Err(StoreError::Gone { what: "survey" })));
 }
 
 pub async fn a_file_is_replaced_only_where_it_is_as_wanted(store: &dyn Store) {

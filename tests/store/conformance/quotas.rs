@@ -3,7 +3,9 @@
 use super::{ORGANISATION, at, claim, enqueue, model, plant, survey};
 use heliomap::plant::PlantId;
 use heliomap::store::usage::UNLIMITED;
-use heliomap::store::{Created, Digest, OrganisationId, Quotas, Store, StoreError, Upload, UploadId, Usage};
+use heliomap::store::{
+    Created, Digest, OrganisationId, Quotas, Store, StoreError, Upload, UploadBounds, UploadId, Usage,
+};
 use uuid::Uuid;
 
 pub async fn quotas(store: &dyn Store) {
@@ -49,12 +51,28 @@ pub async fn quotas(store: &dyn Store) {
         outcome: outcome.then(|| "{}".to_owned()),
     };
     for upload in [upload(1, 7, false, 9), upload(2, 70, true, 9), upload(3, 700, false, 4)] {
-        store.create_upload(&upload).await.unwrap();
+        store.create_upload(&upload, None, at(0)).await.unwrap();
         if let Some(outcome) = &upload.outcome {
             store.end_upload(upload.id, outcome).await.unwrap();
         }
     }
     assert_eq!(usage().await, Usage { bytes: 110, announced_bytes: 7, plants: 2, own });
+    // What begins fits beside what is kept and announced, or, where it may be there already, beside what is announced.
+    store.set_quotas(ORGANISATION, Quotas { bytes: Some(120), plants: Some(2) }).await.unwrap();
+    let bounds = |open, may_be_there| UploadBounds { quotas: none, open, may_be_there };
+    let begin = async |length, bounds: UploadBounds| {
+        let begun = store.create_upload(&upload(4, length, false, 9), Some(&bounds), at(5)).await;
+        store.delete_upload(june.id, UploadId(Uuid::from_u128(4))).await.unwrap();
+        begun
+    };
+    begin(3, bounds(2, false)).await.unwrap();
+    let refused = begin(4, bounds(2, false)).await;
+    assert!(matches!(refused, Err(StoreError::OverQuota { what: "bytes", used: 117, quota: 120 })), "{refused:?}");
+    begin(113, bounds(2, true)).await.unwrap();
+    assert!(matches!(begin(114, bounds(2, true)).await, Err(StoreError::OverQuota { .. })));
+    let refused = begin(1, bounds(1, true)).await;
+    assert!(matches!(refused, Err(StoreError::TooManyUploads { open: 1, most: 1 })), "{refused:?}");
+    store.set_quotas(ORGANISATION, own).await.unwrap();
 
     // A model counts, and what is deleted does not.
     enqueue(store, &june).await;
