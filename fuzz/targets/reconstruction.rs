@@ -29,7 +29,7 @@ fuzz_target!(|bytes: &[u8]| {
     let path = SURVEY.join(FILES[usize::from(*which) % FILES.len()]);
     let before = std::fs::read(&path).ok();
     std::fs::write(&path, document).unwrap();
-    if let Ok(project) = opensfm::read(&SURVEY, 1_000_000) {
+    if let Ok(project) = opensfm::read(&*SURVEY, 1_000_000) {
         assert_eq!(project.photos.len(), project.reconstruction.shots.len());
         for shot in &project.reconstruction.shots {
             assert!(shot.camera.focal_px().is_finite() && shot.camera.focal_px() > 0.0);
