@@ -349,6 +349,31 @@ async fn a_ground_station_finds_again_what_it_began() {
 }
 
 #[tokio::test]
+async fn an_upload_whose_bytes_are_elsewhere_begins_anew() {
+    let app = App::new(&[]).await;
+    let survey = app.survey().await;
+    let photo = jpeg(64, 48);
+    let upload = begin(&app, &survey, photo.len(), &metadata("filename", "a.jpg")).await;
+    more(&app, &upload, 0, &photo[..100]).send().await.unwrap();
+    // As where another machine took the first bytes.
+    std::fs::remove_file(app.folder.path().join("uploads").join(upload.rsplit('/').next().unwrap())).unwrap();
+    let head = tus(&app, Method::HEAD, &upload).send().await.unwrap();
+    assert_eq!(head.status(), StatusCode::NOT_FOUND);
+    let goes_on = more(&app, &upload, 100, &photo[100..]).send().await.unwrap();
+    assert_problem(problem(goes_on).await, 404, "upload_not_found", "begin a new one");
+    let request = tus(&app, Method::POST, &format!("{survey}/uploads")).header("upload-concat", "partial");
+    let answer = request.header("upload-length", 3).send().await.unwrap();
+    let part = answer.headers()["location"].to_str().unwrap().to_owned();
+    more(&app, &part, 0, b"abc").send().await.unwrap();
+    std::fs::remove_file(app.folder.path().join("uploads").join(part.rsplit('/').next().unwrap())).unwrap();
+    let request =
+        tus(&app, Method::POST, &format!("{survey}/uploads")).header("upload-concat", format!("final;{part}"));
+    let joined = request.header("upload-metadata", metadata("filename", "a.jpg")).send().await.unwrap();
+    assert_problem(problem(joined).await, 404, "upload_not_found", "begin a new one");
+    assert_eq!(tus(&app, Method::DELETE, &upload).send().await.unwrap().status(), StatusCode::NO_CONTENT);
+}
+
+#[tokio::test]
 async fn wrong_requests_are_refused() {
     let app = App::new(&[]).await;
     let survey = app.survey().await;

@@ -2,7 +2,7 @@
 
 use super::finish::finish;
 use super::protocol::{Checksum, UPLOAD_EXPIRES, UPLOAD_OFFSET, answer, http_date, number, text, wrong};
-use super::{LIFE, UploadPath, found, take_over};
+use super::{LIFE, UploadPath, found, require_here, take_over};
 use crate::http::AppState;
 use crate::http::error::{ApiError, Code, Problem};
 use crate::http::extract::ApiPath;
@@ -70,6 +70,7 @@ pub(super) async fn add(
     announced.require_fits(&upload)?;
     // Whoever had it may have made more safe on the way out.
     let (taken, mut upload) = take_over(state, path).await?;
+    require_here(state, &upload).await?;
     announced.require_fits(&upload)?;
     let body = body.into_data_stream();
     match upload.received == upload.length {

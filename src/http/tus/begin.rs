@@ -3,7 +3,7 @@
 use super::finish::{finish, remove};
 use super::place::Place;
 use super::protocol::{UPLOAD_EXPIRES, answer, http_date, number, require_version, text, wrong};
-use super::{LIFE, place, require_upload};
+use super::{LIFE, place, require_here, require_upload};
 use crate::http::AppState;
 use crate::http::error::{ApiError, Problem};
 use crate::http::extract::ApiPath;
@@ -160,6 +160,7 @@ async fn finished_parts(state: &AppState, survey: SurveyId, urls: &str) -> Resul
         if !part.partial || part.received < part.length {
             return Err(wrong(format!("{url} is no part that is whole")));
         }
+        require_here(state, &part).await?;
         if !named.insert(part.id) {
             return Err(wrong(format!("{url} is named twice")));
         }

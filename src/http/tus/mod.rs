@@ -19,6 +19,7 @@ pub use desk::Desk;
 use super::AppState;
 use super::error::{ApiError, Code, Problem};
 use super::extract::ApiPath;
+use super::intake::disk;
 use super::uploads::UploadedFile;
 use crate::plant::PlantId;
 use crate::store::{SurveyId, Upload, UploadId};
@@ -169,6 +170,17 @@ async fn require_upload(state: &AppState, survey: SurveyId, id: UploadId) -> Res
     })
 }
 
+/// Refuses to go on with an upload whose bytes are not here: they are on the disk of the machine where it began.
+async fn require_here(state: &AppState, upload: &Upload) -> Result<(), ApiError> {
+    let file = state.blobs.upload_file(upload.id);
+    if upload.outcome.is_some() || tokio::fs::try_exists(&file).await.map_err(|error| disk(&file, error))? {
+        return Ok(());
+    }
+    let detail =
+        "the upload's bytes are not on this machine: send its requests to the one where it began, or begin a new one";
+    Err(ApiError::new(Code::UploadNotFound, detail))
+}
+
 /// What this service speaks of the tus protocol
 #[utoipa::path(
     options,
@@ -220,6 +232,7 @@ pub async fn head(State(state): State<AppState>, ApiPath(path): ApiPath<UploadPa
 
 async fn tell(state: &AppState, path: &UploadPath, headers: &HeaderMap) -> Result<Response, ApiError> {
     let (_taken, upload) = take(state, path, headers).await?;
+    require_here(state, &upload).await?;
     if upload.received == upload.length {
         finish(state, path.plant, &upload).await?;
     }
