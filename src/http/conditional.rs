@@ -24,12 +24,14 @@ pub fn tag(of: &[u8]) -> String {
 /// Tags what was read, and answers `304` where the client has it. An answer that has a tag already keeps it; one whose end
 /// is not known gets none.
 pub async fn conditional(request: Request, next: Next) -> Response {
-    if *request.method() != Method::GET {
+    if !matches!(*request.method(), Method::GET | Method::HEAD) {
         return next.run(request).await;
     }
     let known = request.headers().get_all(header::IF_NONE_MATCH).iter().cloned().collect::<Vec<_>>();
     let response = next.run(request).await;
-    if response.status() != StatusCode::OK {
+    // What nobody may keep changes from one request to the next.
+    let kept = response.headers().get(header::CACHE_CONTROL).is_none_or(|control| control != "no-store");
+    if response.status() != StatusCode::OK || !kept {
         return response;
     }
     let (mut parts, body) = response.into_parts();
@@ -81,6 +83,19 @@ fn tags(headers: &HeaderMap, name: header::HeaderName) -> Option<Vec<String>> {
     values.peek()?;
     let texts = values.filter_map(|value| value.to_str().ok());
     Some(texts.flat_map(|text| text.split(',')).map(|tag| tag.trim().to_owned()).collect())
+}
+
+/// Refuses a request that is about a state of what has none: `what` it brings.
+pub fn refuse(headers: &HeaderMap, what: &str) -> Result<(), ApiError> {
+    match [header::IF_MATCH, header::IF_NONE_MATCH].iter().find(|name| headers.contains_key(*name)) {
+        None => Ok(()),
+        Some(name) => {
+            let detail = format!(
+                "{name} speaks of one file, and this request brings {what}; nothing of it was done: send the files one by one"
+            );
+            Err(ApiError::new(Code::BadRequest, detail))
+        }
+    }
 }
 
 /// What is said where something is not as the request wants it.

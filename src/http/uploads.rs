@@ -15,11 +15,12 @@ use crate::plant::PlantId;
 use crate::store::{Content, FileWritten, ImageName, StagedFile, StoreError, SurveyId, SurveyPath};
 use axum::Json;
 use axum::body::{Body, BodyDataStream};
-use axum::extract::multipart::MultipartRejection;
+use axum::extract::multipart::{Field, MultipartError, MultipartRejection};
 use axum::extract::{Multipart, State};
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
+use std::time::Duration;
 
 /// A file that was uploaded.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
@@ -219,8 +220,10 @@ async fn receive_body(
 pub async fn post_images(
     State(state): State<AppState>,
     ApiPath((plant, survey)): ApiPath<(PlantId, SurveyId)>,
+    headers: HeaderMap,
     form: Result<Multipart, MultipartRejection>,
 ) -> Result<Json<UploadedFiles>, ApiError> {
+    conditional::refuse(&headers, "several files")?;
     let mut form = form.map_err(|_| {
         ApiError::new(
             Code::UnsupportedMediaType,
@@ -231,32 +234,22 @@ pub async fn post_images(
     let mut files = Vec::new();
     let mut refused = Vec::new();
     let mut parts = 0;
+    let idle = state.limits.request_timeout;
     loop {
-        let next = tokio::time::timeout(state.limits.request_timeout, form.next_field()).await;
-        let stalled = |_| ApiError::new(Code::UploadStalled, "the form stood still; send what is not stored yet again");
-        let malformed = |error: axum::extract::multipart::MultipartError| {
-            ApiError::new(Code::BadRequest, format!("the form cannot be read: {}", error.body_text()))
-                .with("files", &files)
-                .with("refused", &refused)
+        let next = in_time(idle, form.next_field()).await;
+        let Some(mut part) = next.map_err(|problem| so_far(problem, &files, &refused))? else { break };
+        let Some(name) = part.file_name().map(str::to_owned) else {
+            skip(idle, &mut part).await.map_err(|problem| so_far(problem, &files, &refused))?;
+            continue;
         };
-        let Some(mut part) = next.map_err(stalled)?.map_err(malformed)? else { break };
-        let Some(name) = part.file_name().map(str::to_owned) else { continue };
         parts += 1;
         if parts > state.limits.max_entries {
-            return Err(ApiError::new(
-                Code::TooLarge,
-                format!("the form has more than {} files; send the rest in another", state.limits.max_entries),
-            )
-            .with("files", &files)
-            .with("refused", &refused));
+            let detail = format!("the form has more than {} files; send the rest in another", state.limits.max_entries);
+            return Err(so_far(ApiError::new(Code::TooLarge, detail), &files, &refused));
         }
         let stored = async {
             let place = SurveyPath::of_image(&ImageName::parse(&name)?);
-            let bounds = Bounds {
-                name: place.as_str(),
-                max_bytes: state.limits.max_image_size,
-                idle: state.limits.request_timeout,
-            };
+            let bounds = Bounds { name: place.as_str(), max_bytes: state.limits.max_image_size, idle };
             let staged = receive(&mut part, state.blobs.staging(), bounds).await?;
             let checked = intake::check(&state, place, staged).await?;
             intake::store(&state, plant, survey, vec![checked], None).await
@@ -264,10 +257,16 @@ pub async fn post_images(
         match stored.await {
             Ok(stored) => files.extend(stored.into_iter().map(uploaded)),
             // The connection or the service failed, not this file: the next would fare no better.
-            Err(problem) if problem.code.parts().0.is_server_error() || problem.code == Code::UploadInterrupted => {
-                return Err(problem.with("files", &files).with("refused", &refused));
+            Err(problem)
+                if problem.code.parts().0.is_server_error()
+                    || matches!(problem.code, Code::UploadInterrupted | Code::UploadStalled) =>
+            {
+                return Err(so_far(problem, &files, &refused));
             }
-            Err(problem) => refused.push(problem.with("name", name).document()),
+            Err(problem) => {
+                refused.push(problem.with("name", name).document());
+                skip(idle, &mut part).await.map_err(|problem| so_far(problem, &files, &refused))?;
+            }
         }
     }
     if !refused.is_empty() {
@@ -284,6 +283,28 @@ pub async fn post_images(
         ));
     }
     Ok(Json(UploadedFiles { files }))
+}
+
+/// What a form brings next, which may take a while, but not stand still.
+async fn in_time<T>(idle: Duration, next: impl Future<Output = Result<T, MultipartError>>) -> Result<T, ApiError> {
+    match tokio::time::timeout(idle, next).await {
+        Ok(Ok(next)) => Ok(next),
+        Ok(Err(error)) => {
+            Err(ApiError::new(Code::BadRequest, format!("the form cannot be read: {}", error.body_text())))
+        }
+        Err(_) => Err(ApiError::new(Code::UploadStalled, "the form stood still; send what is not stored yet again")),
+    }
+}
+
+/// Takes the rest of a part that is not wanted off the line, however long that takes.
+async fn skip(idle: Duration, part: &mut Field<'_>) -> Result<(), ApiError> {
+    while in_time(idle, part.chunk()).await?.is_some() {}
+    Ok(())
+}
+
+/// A problem that ends a form, with what became of its files so far.
+fn so_far(problem: ApiError, files: &[UploadedFile], refused: &[serde_json::Value]) -> ApiError {
+    problem.with("files", files).with("refused", refused)
 }
 
 /// A form of photos.
@@ -326,6 +347,7 @@ pub async fn put_reconstruction(
 ) -> Result<Json<UploadedArchive>, ApiError> {
     let mut body = body.into_data_stream();
     let stored = async {
+        conditional::refuse(&headers, "an archive")?;
         state.require_survey(plant, survey).await?;
         let archive = receive_body(&state, "the archive", state.limits.max_archive_size, &headers, &mut body).await?;
         store_archive(&state, plant, survey, archive).await.map(Json)

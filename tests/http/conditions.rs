@@ -40,6 +40,36 @@ async fn a_file_is_replaced_as_it_was_seen() {
 }
 
 #[tokio::test]
+async fn what_brings_many_files_speaks_of_no_state() {
+    let app = App::new(&[]).await;
+    let survey = app.complete_survey().await;
+    for (name, value) in [("if-match", "\"0000\""), ("if-none-match", "*")] {
+        for method in [Method::PUT, Method::POST] {
+            let archive = app.request(method, &format!("{survey}/reconstruction")).header(name, value).body("PK");
+            assert_problem(json_of(archive.send().await.unwrap()).await, 400, "bad_request", name);
+        }
+        let form = reqwest::multipart::Form::new()
+            .part("f", reqwest::multipart::Part::bytes(b"x".to_vec()).file_name("c.jpg"));
+        let form = app.request(Method::POST, &format!("{survey}/images")).header(name, value).multipart(form);
+        assert_problem(json_of(form.send().await.unwrap()).await, 400, "bad_request", name);
+    }
+}
+
+#[tokio::test]
+async fn what_is_asked_with_head_has_the_tag_of_what_is_read() {
+    let app = App::new(&[]).await;
+    let plant = app.plant().await;
+    let get = app.request(Method::GET, &plant).send().await.unwrap();
+    let head = app.request(Method::HEAD, &plant).send().await.unwrap();
+    for name in ["etag", "content-length", "content-type"] {
+        assert_eq!(head.headers()[name], get.headers()[name], "{name}");
+    }
+    let tag = head.headers()["etag"].clone();
+    let unchanged = app.request(Method::HEAD, &plant).header("if-none-match", tag).send().await.unwrap();
+    assert_eq!(unchanged.status(), StatusCode::NOT_MODIFIED);
+}
+
+#[tokio::test]
 async fn a_plant_is_deleted_as_it_was_seen() {
     let app = App::new(&[]).await;
     let plant = app.plant().await;

@@ -1,6 +1,7 @@
 //! Whoever asks too much, too slowly or without room for it is told so, and the others do not notice.
 
 use crate::app::{Act, App, assert_problem, job_path, jpeg, json_of};
+use futures::StreamExt;
 use heliomap::config::Limits;
 use heliomap::store::Scope;
 use reqwest::{Method, StatusCode};
@@ -80,6 +81,47 @@ async fn who_sends_no_request_is_let_go() {
         let ended = tokio::time::timeout(Duration::from_secs(60), stream.read_to_end(&mut answer)).await;
         assert!(ended.is_ok(), "the service waits for ever after {sent:?}");
     }
+}
+
+#[tokio::test]
+async fn a_form_goes_on_after_a_refused_photo_that_comes_slowly_and_tells_what_is_stored_where_it_stops() {
+    let limits = Limits { request_timeout: Duration::from_secs(1), ..Limits::default() };
+    let app = App::with_limits(&[], limits).await;
+    let survey = app.survey().await;
+    let part = |name: &str, bytes: Vec<u8>| {
+        let head = format!("--x\r\ncontent-disposition: form-data; name=\"f\"; filename=\"{name}\"\r\n\r\n");
+        [head.into_bytes(), bytes, b"\r\n".to_vec()].concat()
+    };
+    let send = |pieces: Vec<(u64, Vec<u8>)>| {
+        let pieces = futures::stream::iter(pieces).then(|(wait_ms, piece)| async move {
+            tokio::time::sleep(Duration::from_millis(wait_ms)).await;
+            Ok::<_, std::io::Error>(piece)
+        });
+        let request = app.request(Method::POST, &format!("{survey}/images"));
+        let request = request.header("content-type", "multipart/form-data; boundary=x");
+        let request = request.body(reqwest::Body::wrap_stream(pieces));
+        async move { json_of(request.send().await.unwrap()).await }
+    };
+    let names = |told: &serde_json::Value| {
+        let files = told["files"].as_array().unwrap().iter();
+        files.map(|file| file["path"].as_str().unwrap().to_owned()).collect::<Vec<_>>()
+    };
+    let mut pieces = vec![(0, part("a.jpg", jpeg(8, 8))), (0, part("clip.MP4", vec![0; 1 << 10]))];
+    // The end of its part is held back.
+    pieces[1].1.truncate((1 << 10) + 50);
+    pieces.extend((0..6).map(|_| (400, vec![0; 10 << 10])));
+    pieces.push((400, [b"\r\n".to_vec(), part("b.jpg", jpeg(9, 8)), b"--x--\r\n".to_vec()].concat()));
+    let (status, told) = send(pieces).await;
+    assert_eq!((status, &told["code"]), (StatusCode::UNPROCESSABLE_ENTITY, &json!("files_refused")), "{told}");
+    assert_eq!(names(&told), ["images/a.jpg", "images/b.jpg"]);
+
+    let half = part("c.jpg", jpeg(64, 48))[..200].to_vec();
+    let pieces =
+        vec![(0, part("a.jpg", jpeg(8, 8))), (0, part("clip.MP4", vec![0; 9])), (0, half), (60_000, Vec::new())];
+    let (status, told) = send(pieces).await;
+    assert_eq!((status, &told["code"]), (StatusCode::REQUEST_TIMEOUT, &json!("upload_stalled")), "{told}");
+    assert_eq!((names(&told), told["refused"].as_array().unwrap().len()), (vec!["images/a.jpg".to_owned()], 1));
+    assert_eq!(told["refused"][0]["name"], "clip.MP4");
 }
 
 #[tokio::test]
