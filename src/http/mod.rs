@@ -19,6 +19,7 @@ mod images;
 mod intake;
 mod jobs;
 mod keys;
+mod loopback;
 mod models;
 mod page;
 mod paging;

@@ -3,7 +3,7 @@
 use super::guard::{Gate, Policy};
 use super::{
     AppState, admission, conditional, docs, encoding, error, events, features, guard, health, idempotency, images,
-    jobs, keys, models, page, plants, surveys, tus, uploads, usage, webhooks,
+    jobs, keys, loopback, models, page, plants, surveys, tus, uploads, usage, webhooks,
 };
 use crate::config::NetworkArgs;
 use crate::telemetry::metrics::RequestLabels;
@@ -122,6 +122,7 @@ pub fn router(state: AppState) -> Router {
     let uploads = uploads().layer(DefaultBodyLimit::disable()).layer(admission);
     let (router, description) = OpenApiRouter::new().merge(prompt).merge(uploads).split_for_parts();
     let (metrics, cors) = (state.metrics.clone(), cors(&state.network));
+    let local = state.insecure.then(|| middleware::from_fn_with_state(state.network.clone(), loopback::only));
     let gate = Gate { state: state.clone(), policy: Arc::new(Policy::of(&description)) };
     router
         .route_layer(middleware::from_fn(conditional::conditional))
@@ -132,6 +133,7 @@ pub fn router(state: AppState) -> Router {
         .method_not_allowed_fallback(|| async { StatusCode::METHOD_NOT_ALLOWED })
         .with_state(state)
         // The innermost first.
+        .layer(tower::util::option_layer(local))
         .layer(CatchPanicLayer::custom(panicked))
         .layer(middleware::map_response(error::only_problems))
         // A plant is megabytes of JSON, which little effort makes small.

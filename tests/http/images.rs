@@ -121,7 +121,7 @@ async fn an_upload_that_stands_still_is_ended() {
     let app = App::with_limits(&[], limits).await;
     let survey = app.survey().await;
     let mut socket = tokio::net::TcpStream::connect(app.base.trim_start_matches("http://")).await.unwrap();
-    let head = format!("PUT {survey}/images/a.jpg HTTP/1.1\r\nhost: x\r\ncontent-length: 1000\r\n\r\nabc");
+    let head = format!("PUT {survey}/images/a.jpg HTTP/1.1\r\nhost: localhost\r\ncontent-length: 1000\r\n\r\nabc");
     socket.write_all(head.as_bytes()).await.unwrap();
     let mut answer = vec![0; 4096];
     let count = socket.read(&mut answer).await.unwrap();

@@ -74,7 +74,7 @@ async fn who_sends_no_request_is_let_go() {
     let limits = Limits { request_timeout: Duration::from_millis(200), ..Limits::default() };
     let app = App::with_limits(&[], limits).await;
     let address = app.base.strip_prefix("http://").unwrap().to_owned();
-    for sent in ["", "GET /health HTTP/1.1\r\nhost: x\r\n"] {
+    for sent in ["", "GET /health HTTP/1.1\r\nhost: localhost\r\n"] {
         let mut stream = TcpStream::connect(&address).await.unwrap();
         stream.write_all(sent.as_bytes()).await.unwrap();
         let mut answer = Vec::new();
@@ -130,7 +130,7 @@ async fn connections_beyond_the_limit_wait_and_are_served_then() {
     let address = app.base.strip_prefix("http://").unwrap().to_owned();
     let first = TcpStream::connect(&address).await.unwrap();
     let mut second = TcpStream::connect(&address).await.unwrap();
-    second.write_all(b"GET /health HTTP/1.1\r\nhost: x\r\nconnection: close\r\n\r\n").await.unwrap();
+    second.write_all(b"GET /health HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n\r\n").await.unwrap();
     let mut byte = [0];
     let early = tokio::time::timeout(Duration::from_millis(200), second.read_exact(&mut byte)).await;
     assert!(early.is_err(), "the second connection is served beside the first");
@@ -182,6 +182,35 @@ async fn scripts_of_other_pages_get_in_where_that_is_configured() {
     let closed = App::new(&[]).await;
     let answer = closed.request(Method::GET, "/api/v1/plants").header("origin", origin).send().await.unwrap();
     assert!(!answer.headers().contains_key("access-control-allow-origin"));
+}
+
+#[tokio::test]
+async fn without_keys_pages_of_other_sites_get_nothing_done() {
+    let origin = "https://dashboard.example.org";
+    let app = App::for_pages_of(origin).await;
+    let survey = app.survey().await;
+    // A name that was made to lead here.
+    for path in ["/api/v1/plants", "/openapi.yaml", "/"] {
+        let rebound = app.request(Method::GET, path).header("host", "evil.example").send().await.unwrap();
+        assert_problem(json_of(rebound).await, 403, "forbidden", "localhost");
+    }
+    let start = |from: &[(&'static str, &str)]| {
+        let request = app.request(Method::POST, &format!("{survey}/jobs")).header("content-type", "text/plain");
+        let request = from.iter().fold(request, |request, (name, value)| request.header(*name, *value));
+        request.header("sec-fetch-site", "cross-site").body("{}").send()
+    };
+    for from in [&[][..], &[("origin", "https://evil.example")]] {
+        assert_problem(json_of(start(from).await.unwrap()).await, 403, "forbidden", "other sites");
+    }
+    let let_in = json_of(start(&[("origin", origin)]).await.unwrap()).await;
+    assert_ne!(let_in.0, StatusCode::FORBIDDEN, "{let_in:?}");
+    let read = app.request(Method::GET, "/api/v1/plants").header("sec-fetch-site", "cross-site").send().await.unwrap();
+    assert_eq!(read.status(), StatusCode::OK);
+
+    let mut guarded = App::with_keys().await;
+    guarded.secret = Some(guarded.key("owner", &[Scope::Read], None).await);
+    let named = guarded.request(Method::GET, "/api/v1/plants").header("host", "heliomap.example.org").send().await;
+    assert_eq!(named.unwrap().status(), StatusCode::OK);
 }
 
 #[tokio::test]
