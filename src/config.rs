@@ -115,7 +115,8 @@ impl WebhookArgs {
 /// Where the process tells what it counts.
 #[derive(Debug, Clone, Default, Args)]
 pub struct MetricsArgs {
-    /// Address and port of a listener of its own that answers `GET /metrics` in Prometheus' form, to whoever asks.
+    /// Address and port of a listener of its own that answers `GET /metrics` in Prometheus' form, and `GET /health`, to
+    /// whoever asks.
     #[arg(long, env = "HELIOMAP_METRICS_LISTEN", value_name = "ADDRESS")]
     pub metrics_listen: Option<SocketAddr>,
 }

@@ -38,6 +38,10 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
             .with_context(|| format!("cannot listen on {}; choose another address with --listen", args.listen))?;
         let address = listener.local_addr()?;
 
+        let mut limits = args.limits;
+        if args.network.behind_proxy {
+            limits.max_connections_per_address = usize::MAX;
+        }
         let state = AppState {
             network: Arc::new(args.network),
             bell: Arc::new(Notify::new()),
@@ -46,7 +50,7 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
             targets: args.webhooks.targets(),
             mapper: mapper.clone(),
             insecure: args.insecure,
-            ..AppState::new(store.clone(), blobs.clone(), args.limits.clone())
+            ..AppState::new(store.clone(), blobs.clone(), limits.clone())
         };
         let (metrics, bell, answering) = (state.metrics.clone(), state.bell.clone(), state.answering.clone());
         let scrape = Scrape { metrics: metrics.clone(), store: store.clone(), blobs: blobs.clone() };
@@ -58,7 +62,7 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
             tokio::spawn(async move { worker.run(stop).await })
         });
 
-        let (app, limits, closing) = (http::router(state), args.limits, stop.clone());
+        let (app, closing) = (http::router(state), stop.clone());
         let serving = tokio::spawn(async move { http::serve(listener, app, &limits, closing).await });
         if !args.insecure && store.keys(None, TimeSpan::default(), Page { after: None, limit: 1 }).await?.is_empty() {
             tracing::warn!(

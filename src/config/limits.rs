@@ -45,6 +45,10 @@ pub struct Limits {
     /// Most connections at once; more wait.
     #[arg(long, env = "HELIOMAP_MAX_CONNECTIONS", default_value_t = 1024, value_name = "COUNT")]
     pub max_connections: usize,
+    /// Most connections from one address at once (from one /64 with IPv6); more are closed. Of no effect with
+    /// `--behind-proxy`, where all come from the proxy.
+    #[arg(long, env = "HELIOMAP_MAX_CONNECTIONS_PER_ADDRESS", default_value_t = 256, value_name = "COUNT")]
+    pub max_connections_per_address: usize,
     /// Most unfinished resumable uploads of an organisation.
     #[arg(long, env = "HELIOMAP_MAX_UPLOADS", default_value_t = 10_000, value_name = "COUNT")]
     pub max_uploads: u64,
@@ -83,6 +87,7 @@ impl Default for Limits {
             max_requests_per_second: 300,
             max_failed_logins_per_minute: 300,
             max_connections: 1024,
+            max_connections_per_address: 256,
             max_uploads: 10_000,
             disk_reserve: 1 << 30,
             quota_bytes: None,

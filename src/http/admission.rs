@@ -14,9 +14,15 @@ use axum::extract::{MatchedPath, RawPathParams, Request, State};
 use axum::http::{HeaderMap, Method, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
+use bytes::Bytes;
 use futures::StreamExt;
 use std::sync::{Arc, OnceLock};
+use std::time::{Duration, Instant};
 use uuid::Uuid;
+
+/// Least bytes per second of an upload, on average, once it lasts longer than two times the patience with one that stands
+/// still: a line may be slow, but nobody keeps a connection for a byte now and then.
+const LEAST_BYTES_PER_SECOND: f64 = 256.0;
 
 /// How much of an upload comes before the disk is looked at again. Many uploads at once stay within the reserve.
 const LOOK_EVERY_BYTES: u64 = 16 << 20;
@@ -103,8 +109,16 @@ fn room_on_disk(state: &AppState, bytes: u64) -> Result<(), ApiError> {
     .retry_after(60))
 }
 
-/// A body that counts, and ends with an error where the disk gets full or there is more than there is room for.
+/// A body that counts, and ends with an error where the disk gets full, there is more than there is room for, or it comes too
+/// slowly. Only while it is waited for does its time run.
 fn watched(state: AppState, body: Body, room: Option<u64>, refused: Arc<OnceLock<ApiError>>) -> Body {
+    let timed = futures::stream::unfold((body.into_data_stream(), Duration::ZERO), |(mut body, waited)| async move {
+        let begun = Instant::now();
+        let chunk = body.next().await?;
+        let waited = waited + begun.elapsed();
+        Some(((chunk, waited), (body, waited)))
+    });
+    let grace = 2 * state.limits.request_timeout;
     let (mut since, mut sum) = (0, 0);
     let refuse = move |problem: ApiError| {
         let error = axum::Error::new(std::io::Error::other(problem.detail.clone()));
@@ -112,13 +126,20 @@ fn watched(state: AppState, body: Body, room: Option<u64>, refused: Arc<OnceLock
         let _ = refused.set(problem);
         error
     };
-    Body::from_stream(body.into_data_stream().map(move |chunk| {
+    Body::from_stream(timed.fuse().map(move |(chunk, waited): (Result<Bytes, _>, Duration)| {
         let chunk = chunk?;
         state.metrics.upload_bytes.inc_by(chunk.len() as u64);
         since += chunk.len() as u64;
         sum += chunk.len() as u64;
         if let Some(room) = room.filter(|room| sum > *room) {
             return Err(refuse(usage::no_room(room)));
+        }
+        if waited > grace && (sum as f64) < waited.as_secs_f64() * LEAST_BYTES_PER_SECOND {
+            let detail = format!(
+                "{sum} bytes came in {} s, which is too slow; where the line is that bad, send it as a resumable upload",
+                waited.as_secs()
+            );
+            return Err(refuse(ApiError::new(Code::UploadStalled, detail)));
         }
         if since >= LOOK_EVERY_BYTES {
             since = 0;

@@ -5,8 +5,9 @@ use axum::Router;
 use hyper::server::conn::http1;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::server::graceful::GracefulShutdown;
-use std::net::SocketAddr;
-use std::sync::Arc;
+use std::collections::HashMap;
+use std::net::{IpAddr, Ipv6Addr, SocketAddr};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
@@ -19,18 +20,23 @@ const MAX_HEAD_BYTES: usize = 64 << 10;
 /// How long nothing is accepted after accepting failed, as it does without free file descriptors.
 const PAUSE: Duration = Duration::from_millis(100);
 
+/// How long a connection may be silent at its beginning.
+const FIRST_BYTE: Duration = Duration::from_secs(10);
+
 /// Where a request came from.
 #[derive(Debug, Clone, Copy)]
 pub struct Peer(pub SocketAddr);
 
 /// Serves until `stop`, then ends the requests that are being answered, and returns.
 ///
-/// A connection is closed whose next request's head is not whole within `limits.request_timeout`, or whose client takes
-/// nothing of an answer for so long. Beyond `limits.max_connections` new ones wait.
+/// A connection is closed whose first byte does not come within 10 s, whose next request's head is not whole within `limits.request_timeout`, or whose client takes
+/// nothing of an answer for so long. Beyond `limits.max_connections` new ones wait; beyond
+/// `limits.max_connections_per_address` those of one address are closed.
 pub async fn serve(listener: TcpListener, router: Router, limits: &Limits, stop: CancellationToken) {
     let graceful = GracefulShutdown::new();
     let room = Arc::new(Semaphore::new(limits.max_connections));
     let patience = limits.request_timeout;
+    let crowd = Arc::new(Crowd::default());
     loop {
         let accepted = async {
             // The semaphore is never closed.
@@ -49,14 +55,28 @@ pub async fn serve(listener: TcpListener, router: Router, limits: &Limits, stop:
                 continue;
             }
         };
+        let Some(one) = crowd.admit(address.ip(), limits.max_connections_per_address) else {
+            tracing::debug!(%address, "there are too many connections from this address");
+            continue;
+        };
         let watcher = graceful.watcher();
-        let router = router.clone();
+        let (router, closing) = (router.clone(), stop.clone());
         tokio::spawn(async move {
-            let _place = place;
+            let _held = (place, one);
             let service = hyper::service::service_fn(move |mut request: hyper::Request<hyper::body::Incoming>| {
                 request.extensions_mut().insert(Peer(address));
                 router.clone().oneshot(request)
             });
+            // Nothing is lost with a connection on which nothing came.
+            let first = tokio::time::timeout(FIRST_BYTE.min(patience), stream.readable());
+            let came = tokio::select! {
+                biased;
+                first = first => matches!(first, Ok(Ok(()))),
+                () = closing.cancelled() => false,
+            };
+            if !came {
+                return;
+            }
             let mut builder = http1::Builder::new();
             builder.timer(TokioTimer::new()).header_read_timeout(patience).max_buf_size(MAX_HEAD_BYTES);
             let connection = builder.serve_connection(TokioIo::new(bounded(stream, patience)), service);
@@ -67,6 +87,54 @@ pub async fn serve(listener: TcpListener, router: Router, limits: &Limits, stop:
     }
     drop(listener);
     graceful.shutdown().await;
+}
+
+/// How many connections there are from each address.
+#[derive(Debug, Default)]
+struct Crowd(Mutex<HashMap<IpAddr, usize>>);
+
+/// One connection of an address, until it is dropped.
+struct One {
+    crowd: Arc<Crowd>,
+    network: IpAddr,
+}
+
+impl Crowd {
+    fn counts(&self) -> std::sync::MutexGuard<'_, HashMap<IpAddr, usize>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// One more connection from an address; `None` where there are as many as there may be.
+    fn admit(self: &Arc<Self>, address: IpAddr, most: usize) -> Option<One> {
+        let network = network(address);
+        let mut counts = self.counts();
+        let count = counts.entry(network).or_default();
+        if *count >= most {
+            return None;
+        }
+        *count += 1;
+        Some(One { crowd: self.clone(), network })
+    }
+}
+
+impl Drop for One {
+    fn drop(&mut self) {
+        let mut counts = self.crowd.counts();
+        if let Some(count) = counts.get_mut(&self.network) {
+            *count -= 1;
+            if *count == 0 {
+                counts.remove(&self.network);
+            }
+        }
+    }
+}
+
+/// Whose an address is: with IPv6, one machine has a whole /64.
+fn network(address: IpAddr) -> IpAddr {
+    match address.to_canonical() {
+        IpAddr::V4(address) => address.into(),
+        IpAddr::V6(address) => Ipv6Addr::from_bits(address.to_bits() >> 64 << 64).into(),
+    }
 }
 
 /// A stream whose client takes something of what is sent within so long.

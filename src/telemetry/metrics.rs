@@ -199,9 +199,13 @@ pub struct Scrape {
     pub blobs: Blobs,
 }
 
-/// `GET /metrics` alone: for a listener of its own, since it tells of all organisations.
+/// `GET /metrics`, for a listener of its own, since it tells of all organisations; and `GET /health`, which answers there
+/// however many connections the clients hold.
 pub fn router(scrape: Scrape) -> Router {
-    Router::new().route("/metrics", get(serve)).with_state(scrape)
+    Router::new()
+        .route("/metrics", get(serve))
+        .route("/health", get(async || StatusCode::NO_CONTENT))
+        .with_state(scrape)
 }
 
 async fn serve(State(scrape): State<Scrape>) -> Response {

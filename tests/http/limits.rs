@@ -125,6 +125,42 @@ async fn a_form_goes_on_after_a_refused_photo_that_comes_slowly_and_tells_what_i
 }
 
 #[tokio::test]
+async fn an_upload_of_a_byte_now_and_then_is_ended() {
+    let limits = Limits { request_timeout: Duration::from_millis(600), ..Limits::default() };
+    let app = App::with_limits(&[], limits).await;
+    let survey = app.survey().await;
+    let bytes = futures::stream::iter(0..3_000).then(|_| async {
+        tokio::time::sleep(Duration::from_millis(200)).await;
+        Ok::<_, std::io::Error>(vec![b' '])
+    });
+    let put = app.request(Method::PUT, &format!("{survey}/reconstruction/reconstruction.json"));
+    let put = put.body(reqwest::Body::wrap_stream(bytes)).send();
+    let answer = tokio::time::timeout(Duration::from_secs(60), put).await.expect("it goes on for ever").unwrap();
+    assert_problem(json_of(answer).await, 408, "upload_stalled", "too slow");
+}
+
+#[tokio::test]
+async fn one_address_holds_so_many_connections() {
+    let app = App::with_limits(&[], Limits { max_connections_per_address: 2, ..Limits::default() }).await;
+    let address = app.base.strip_prefix("http://").unwrap().to_owned();
+    let ask = async |stream: &mut TcpStream| {
+        let request = b"GET /health HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n\r\n";
+        let mut answer = String::new();
+        let _ = stream.write_all(request).await;
+        let _ = stream.read_to_string(&mut answer).await;
+        answer
+    };
+    let mut held = [TcpStream::connect(&address).await.unwrap(), TcpStream::connect(&address).await.unwrap()];
+    let mut third = TcpStream::connect(&address).await.unwrap();
+    assert_eq!(ask(&mut third).await, "", "the third connection is served");
+    for stream in &mut held {
+        assert!(ask(stream).await.contains("\"ok\""));
+    }
+    let answer = ask(&mut TcpStream::connect(&address).await.unwrap()).await;
+    assert!(answer.contains("\"ok\""), "{answer}");
+}
+
+#[tokio::test]
 async fn connections_beyond_the_limit_wait_and_are_served_then() {
     let app = App::with_limits(&[], Limits { max_connections: 1, ..Limits::default() }).await;
     let address = app.base.strip_prefix("http://").unwrap().to_owned();
