@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import http.server
 import io
 import json
 import os
@@ -108,6 +109,72 @@ class ClientTest(unittest.TestCase):
         self.assertEqual([file["sha256"] for file in report.stored], [digest])
         self.assertFalse(state.exists())
         self.assertEqual(client.open("HEAD", url, headers=uploading.TUS).headers["Upload-Offset"], str(cloud.stat().st_size))
+
+    def test_a_key_for_one_plant_does_what_it_is_for_and_no_plant_is_made_by_mistake(self) -> None:
+        client = self.client("--no-worker")
+        survey = self.folder / "survey"
+        lay_out_example(survey)
+        plant = client.create_plant("Sunfield")["id"]
+        client.create_plant("Sunfield North")
+
+        def run(scope: str, *arguments: str) -> tuple[int, str]:
+            asked = {"name": scope, "scopes": [scope], "plants": [plant]}
+            key = client.call("POST", "/api/v1/keys", asked)["secret"]
+            told = io.StringIO()
+            with contextlib.redirect_stdout(told), contextlib.redirect_stderr(told):
+                status = main(["--url", self.service.url, "--key", key, *arguments])
+            return status, told.getvalue()
+
+        here = ("--plant", "Sunfield", "--survey", "June")
+        self.assertEqual(run("upload", "upload", str(survey), *here)[0], 0)
+        self.assertEqual(run("upload", "start", *here)[0], 0)
+        target = self.folder / "plant.geojson"
+        for name, why in (("Sunfield", "model_not_found"), ("Sunfeld", "no plant of the name"), ("Sunfield North", "no plant")):
+            status, told = run("read", "fetch", "--plant", name, "--out", str(target))
+            self.assertEqual((status, why in told), (1, True), told)
+        status, told = run("upload", "start", "--plant", "Sunfield", "--survey", "Jun")
+        self.assertEqual((status, "no survey of the name" in told), (1, True), told)
+        self.assertEqual([plant["name"] for plant in client.plants()], ["Sunfield", "Sunfield North"])
+
+    def test_an_answer_that_breaks_off_is_asked_for_again(self) -> None:
+        whole = json.dumps({"type": "FeatureCollection", "features": [], "padding": "x" * 100_000}).encode()
+        answers: list[str] = []
+
+        class Breaking(http.server.BaseHTTPRequestHandler):
+            protocol_version = "HTTP/1.1"
+
+            def do_GET(self) -> None:
+                kind = answers.pop(0)
+                self.send_response(200)
+                self.send_header("Connection", "close")
+                if kind == "chunks":
+                    self.send_header("Transfer-Encoding", "chunked")
+                    self.end_headers()
+                    self.wfile.write(b"%x\r\n" % len(whole) + whole[:50_000])
+                else:
+                    self.send_header("Content-Length", str(len(whole)))
+                    self.end_headers()
+                    self.wfile.write(whole if kind == "whole" else whole[:50_000])
+                self.close_connection = True
+
+            def log_message(self, *_: object) -> None:
+                pass
+
+        server = self.enterContext(http.server.HTTPServer(("127.0.0.1", 0), Breaking))
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        self.addCleanup(server.shutdown)
+        client = Client(f"http://127.0.0.1:{server.server_port}", tries=3)
+        target = self.folder / "plant.geojson"
+        answers[:] = ["chunks", "length", "whole"]
+        client.fetch_layer("p", target)
+        self.assertEqual(target.read_bytes(), whole)
+        answers[:] = ["chunks", "length", "whole"]
+        self.assertEqual(client.job("p", "j"), json.loads(whole))
+        target.unlink()
+        answers[:] = ["chunks", "length", "chunks"]
+        with self.assertRaises(Unreachable):
+            client.fetch_layer("p", target)
+        self.assertEqual(list(self.folder.iterdir()), [])
 
     def test_a_key_that_is_not_good_is_told_at_once(self) -> None:
         self.client("--no-worker")

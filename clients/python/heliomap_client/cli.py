@@ -35,9 +35,10 @@ def _parser() -> argparse.ArgumentParser:
         if "folder" in names:
             one.add_argument("folder", type=Path, help="a folder as OpenSfM leaves it")
             one.add_argument("--parallel", type=int, default=4, help="files at once")
-        one.add_argument("--plant", required=True, help="the plant's name; made where there is none")
+        made = "; made where there is none" if "folder" in names else ""
+        one.add_argument("--plant", required=True, help=f"the plant's name{made}")
         if "survey" in names:
-            one.add_argument("--survey", required=True, help="the survey's name; made where there is none")
+            one.add_argument("--survey", required=True, help=f"the survey's name{made}")
         if "out" in names:
             one.add_argument("--out", type=Path, required=True, help="the GeoJSON file to write")
             one.add_argument("--layer", default="modules", choices=["modules", "sectors", "benches", "lines"])
@@ -51,13 +52,24 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _survey(client: Client, args: argparse.Namespace) -> tuple[str, str]:
-    plant = client.create_plant(args.plant)["id"]
-    return plant, client.create_survey(plant, args.survey)["id"]
+def _plant(client: Client, args: argparse.Namespace, make: bool = False) -> str:
+    """The plant of that name. A key for that plant alone finds it, too; only a key for all makes one."""
+    found = client.find_plant(args.plant) or (client.create_plant(args.plant) if make else None)
+    if found is None:
+        raise HeliomapError(f"this key sees no plant of the name `{args.plant}`")
+    return found["id"]
+
+
+def _survey(client: Client, args: argparse.Namespace, make: bool = False) -> tuple[str, str]:
+    plant = _plant(client, args, make)
+    found = client.find_survey(plant, args.survey) or (client.create_survey(plant, args.survey) if make else None)
+    if found is None:
+        raise HeliomapError(f"the plant has no survey of the name `{args.survey}`")
+    return plant, found["id"]
 
 
 def _upload(client: Client, args: argparse.Namespace) -> int:
-    plant, survey = _survey(client, args)
+    plant, survey = _survey(client, args, make=True)
     report = client.upload_folder(plant, survey, args.folder, parallel=args.parallel, on_file=_tell_file)
     for path, problem in report.refused.items():
         print(f"{path}: refused, {problem}", file=sys.stderr)
@@ -79,7 +91,7 @@ def _start(client: Client, args: argparse.Namespace) -> int:
 
 
 def _follow(client: Client, args: argparse.Namespace) -> int:
-    job = client.follow(client.create_plant(args.plant)["id"], args.job, _tell_job)
+    job = client.follow(_plant(client, args), args.job, _tell_job)
     return 0 if job["state"] == "succeeded" else 1
 
 
@@ -91,7 +103,7 @@ def _tell_job(job: Json) -> None:
 
 
 def _fetch(client: Client, args: argparse.Namespace) -> int:
-    client.fetch_layer(client.create_plant(args.plant)["id"], args.out, args.layer)
+    client.fetch_layer(_plant(client, args), args.out, args.layer)
     print(args.out)
     return 0
 

@@ -6,14 +6,13 @@ import http.client
 import json
 import os
 import random
-import shutil
 import time
 import urllib.error
 import urllib.parse
 import urllib.request
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Protocol
+from typing import IO, TYPE_CHECKING, Any, Protocol, TypeVar
 
 if TYPE_CHECKING:
     from .upload import UploadReport
@@ -24,6 +23,11 @@ Json = dict[str, Any]
 FINAL = ("succeeded", "failed", "cancelled")
 """States in which a job does not change any more."""
 
+COPIED_BYTES = 1 << 16
+"""How much of an answer is in memory at once."""
+
+T = TypeVar("T")
+
 
 class HeliomapError(Exception):
     """Whatever this client raises of itself."""
@@ -32,9 +36,11 @@ class HeliomapError(Exception):
 class Problem(HeliomapError):
     """The service refused a request and says why (RFC 9457)."""
 
-    def __init__(self, status: int, document: Json):
+    def __init__(self, status: int, document: Json, retry_after_s: float | None = None):
         self.status = status
         self.document = document
+        self.retry_after_s = retry_after_s
+        """When the service asks to come again, where it says."""
         self.code: str = document.get("code", str(status))
         """A stable word."""
         super().__init__(f"{self.code}: {document.get('detail') or document.get('title') or 'no reason was given'}")
@@ -88,25 +94,37 @@ class Client:
 
         Raises `Problem` where the service refuses, `Unreachable` where it does not answer.
         """
+        return self._sent(method, path, headers, body, tries, lambda answer: answer)
+
+    def _sent(
+        self,
+        method: str,
+        path: str,
+        headers: Mapping[str, str] | None,
+        body: Callable[[], bytes | _Body | None],
+        tries: int | None,
+        read: Callable[[http.client.HTTPResponse], T],
+    ) -> T:
+        """As `open`; what `read` makes of the answer, asked for anew where the line breaks while it reads."""
         tries = tries or self._tries
         for attempt in range(1, tries + 1):
             request = urllib.request.Request(self._root + path, data=body(), method=method, headers=dict(headers or {}))
             if self._key:
                 request.add_header("Authorization", f"Bearer {self._key}")
             try:
-                return self._opener.open(request, timeout=self._timeout_s)
+                return read(self._opener.open(request, timeout=self._timeout_s))
             except urllib.error.HTTPError as answer:
                 with answer:
-                    problem = Problem(answer.code, _document(answer))
                     wait = answer.headers.get("Retry-After", "")
+                    problem = Problem(answer.code, _document(answer), float(wait) if wait.isdigit() else None)
                 # What a later try may mend: busy, overloaded, standing still, interrupted, failing.
                 if attempt == tries or not (answer.code in (408, 423, 429) or answer.code >= 500 or problem.code == "upload_interrupted"):
                     raise problem from None
-                pause = float(wait) if wait.isdigit() else _pause(attempt)
+                pause = pause_s(attempt) if problem.retry_after_s is None else problem.retry_after_s
             except (OSError, http.client.HTTPException) as error:
                 if attempt == tries:
                     raise Unreachable(f"{self._root} does not answer: {error}") from error
-                pause = _pause(attempt)
+                pause = pause_s(attempt)
             time.sleep(pause)
         raise AssertionError("the last try returns or raises")
 
@@ -116,9 +134,13 @@ class Client:
         if value is not None:
             headers["Content-Type"] = "application/json"
         encoded = None if value is None else json.dumps(value).encode()
-        with self.open(method, path, headers=headers, body=lambda: encoded) as answer:
-            text = answer.read()
-        return json.loads(text) if text else {}
+
+        def text(answer: http.client.HTTPResponse) -> bytes:
+            with answer:
+                return answer.read()
+
+        told = self._sent(method, path, headers, lambda: encoded, None, text)
+        return json.loads(told) if told else {}
 
     def items(self, path: str) -> Iterator[Json]:
         """All items of a list, part by part."""
@@ -134,6 +156,10 @@ class Client:
         """Creates a plant, or finds the one of that name."""
         return self.call("POST", "/api/v1/plants", {"name": name})
 
+    def find_plant(self, name: str) -> Json | None:
+        """The plant of that name, where the key may see it."""
+        return _named(self.items(f"/api/v1/plants?name={_part(name)}"), name)
+
     def plants(self) -> Iterator[Json]:
         """All plants that the key may see."""
         return self.items("/api/v1/plants")
@@ -141,6 +167,10 @@ class Client:
     def create_survey(self, plant: str, name: str) -> Json:
         """Creates a survey of a plant, or finds the one of that name."""
         return self.call("POST", f"{_plant(plant)}/surveys", {"name": name})
+
+    def find_survey(self, plant: str, name: str) -> Json | None:
+        """The plant's survey of that name."""
+        return _named(self.items(f"{_plant(plant)}/surveys?name={_part(name)}"), name)
 
     def survey(self, plant: str, survey: str) -> Json:
         """A survey: its files, and what is missing before it can be mapped."""
@@ -209,9 +239,20 @@ class Client:
         path = f"{_plant(plant)}/models/{_part(str(version))}/{_part(layer)}"
         target = Path(target)
         partial = target.with_name(target.name + ".part")
+
+        def copy(answer: http.client.HTTPResponse) -> None:
+            with answer, open(partial, "wb") as file:
+                while chunk := answer.read(COPIED_BYTES):
+                    try:
+                        file.write(chunk)
+                    except OSError as error:
+                        raise HeliomapError(f"{partial} cannot be written: {error}") from error
+                # An answer of known length that ends early ends without a word.
+                if answer.length:
+                    raise http.client.IncompleteRead(b"", answer.length)
+
         try:
-            with self.open("GET", path, headers={"Accept": "application/geo+json"}) as answer, open(partial, "wb") as file:
-                shutil.copyfileobj(answer, file)
+            self._sent("GET", path, {"Accept": "application/geo+json"}, lambda: None, None, copy)
             partial.replace(target)
         finally:
             partial.unlink(missing_ok=True)
@@ -219,6 +260,11 @@ class Client:
     def module(self, plant: str, module: str) -> Json:
         """One module of the newest model, a GeoJSON feature."""
         return self.call("GET", f"{_plant(plant)}/modules/{_part(module)}")
+
+
+def _named(items: Iterator[Json], name: str) -> Json | None:
+    """The one of that name among those whose names begin so."""
+    return next((item for item in items if item["name"] == name), None)
 
 
 def _part(text: str) -> str:
@@ -234,7 +280,7 @@ def survey_path(plant: str, survey: str) -> str:
     return f"{_plant(plant)}/surveys/{_part(survey)}"
 
 
-def _pause(attempt: int) -> float:
+def pause_s(attempt: int) -> float:
     """Seconds before the next try: twice as long each time, half a minute at most, by chance up to half as long again."""
     return min(30.0, 0.25 * 2.0**attempt) * random.uniform(1.0, 1.5)
 

@@ -7,12 +7,13 @@ import concurrent.futures
 import hashlib
 import json
 import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import quote
 
-from .client import Client, Json, Problem, Unreachable, survey_path
+from .client import Client, Json, Problem, Unreachable, pause_s, survey_path
 
 RECONSTRUCTION = (
     "boxes.json",
@@ -199,6 +200,8 @@ def _resumed(client: Client, here: str, place: str, path: Path, digest: bytes, p
             stalled = stalled + 1 if offset == before else 0
             if stalled >= 8:
                 raise
+            asked_s = error.retry_after_s if isinstance(error, Problem) else None
+            time.sleep(pause_s(stalled) if asked_s is None else asked_s)
     outcome = client.call("GET", url).get("outcome", {})
     pending.set(here, place, digest, None)
     if outcome.get("problem"):
