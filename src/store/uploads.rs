@@ -23,6 +23,8 @@ pub struct Upload {
     pub received: u64,
     /// Whether it is a part of a file that is put together later.
     pub partial: bool,
+    /// From what it was put together, as the client told it; lists leave it out.
+    pub parts: Option<String>,
     /// What the client told of the file, as it told it.
     pub metadata: String,
     pub expires: Timestamp,

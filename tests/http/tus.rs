@@ -254,7 +254,13 @@ async fn a_file_is_put_together_from_its_parts() {
     assert_problem(join(format!("final;{lonely}")).await, 400, "bad_request", "no part that is whole");
     let twice = format!("final;{} {}", parts.join(" "), parts[0]);
     assert_problem(join(twice).await, 400, "bad_request", "named twice");
-    assert_eq!(join(format!("final;{}", parts.join(" "))).await.0, StatusCode::CREATED);
+    let concat = format!("final;{}", parts.join(" "));
+    let request = tus(&app, Method::POST, &format!("{survey}/uploads")).header("upload-concat", &concat);
+    let whole = request.header("upload-metadata", metadata("filename", "a.jpg")).send().await.unwrap();
+    assert_eq!(whole.status(), StatusCode::CREATED);
+    let whole = whole.headers()["location"].to_str().unwrap().to_owned();
+    let told = tus(&app, Method::HEAD, &whole).send().await.unwrap();
+    assert_eq!((told.status(), told.headers()["upload-concat"].to_str().unwrap()), (StatusCode::OK, concat.as_str()));
     assert_eq!(app.get(&survey).await.1["files"][0]["sha256"], Digest::of(&photo).to_string());
     assert_problem(app.get(&parts[0]).await, 404, "upload_not_found", "begin a new one");
 }

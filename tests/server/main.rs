@@ -184,6 +184,7 @@ fn uploads_whose_time_is_over_are_forgotten_while_the_service_runs() {
         length: 9,
         received: 0,
         partial: false,
+        parts: None,
         metadata: "filename YS5qcGc=".to_owned(),
         expires: jiff::Timestamp::now() + expires,
         outcome: None,
@@ -450,6 +451,8 @@ fn metrics_are_told_on_a_listener_of_their_own() {
     let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
     let _program = Program(child);
     let address = lines.find_map(|line| line.unwrap().strip_prefix("metrics are on ").map(str::to_owned)).unwrap();
+    let health = client().get(address.replace("/metrics", "/health")).send().unwrap();
+    assert_eq!(health.status(), 204);
     let answer = client().get(address).send().unwrap();
     assert!(answer.headers()["content-type"].to_str().unwrap().starts_with("application/openmetrics-text"));
     assert!(answer.text().unwrap().contains("heliomap_queue_depth 0"));

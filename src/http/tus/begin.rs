@@ -116,6 +116,7 @@ async fn create_upload(
         length,
         received: if parts.is_some() { length } else { 0 },
         partial,
+        parts: concat.filter(|_| parts.is_some()).map(str::to_owned),
         metadata: metadata.to_owned(),
         expires: Timestamp::now() + LIFE,
         outcome: None,

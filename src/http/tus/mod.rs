@@ -245,8 +245,9 @@ async fn tell(state: &AppState, path: &UploadPath, headers: &HeaderMap) -> Resul
     {
         answer.insert("upload-metadata", metadata);
     }
-    if upload.partial {
-        answer.insert("upload-concat", HeaderValue::from_static("partial"));
+    let concat = if upload.partial { Some("partial") } else { upload.parts.as_deref() };
+    if let Some(concat) = concat.and_then(|concat| HeaderValue::from_str(concat).ok()) {
+        answer.insert("upload-concat", concat);
     }
     let expires = HeaderValue::from_str(&http_date(upload.expires)).map_err(|error| ApiError::internal(&error))?;
     answer.insert(UPLOAD_EXPIRES, expires);

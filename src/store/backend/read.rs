@@ -123,6 +123,7 @@ pub fn upload(row: &Row) -> Result<Upload, StoreError> {
         length: row.try_get::<i64, _>("length")? as u64,
         received: row.try_get::<i64, _>("received")? as u64,
         partial: row.try_get("partial")?,
+        parts: row.try_get("parts")?,
         metadata: row.try_get("metadata")?,
         expires: time(row, "expires_ms")?,
         outcome: row.try_get("outcome")?,

@@ -28,6 +28,7 @@ impl UploadStore for Rows {
             .bind(upload.partial)
             .bind(&upload.metadata)
             .bind(upload.expires.as_millisecond())
+            .bind(&upload.parts)
             .execute(&mut *tx)
             .await
             .map_err(super::gone("survey"))?;

@@ -70,6 +70,7 @@ pub async fn uploads(store: &dyn Store) {
         length: 1 << 40,
         received: 0,
         partial: true,
+        parts: None,
         metadata: "filename YS5qcGc=".to_owned(),
         expires: at(100),
         outcome: None,
@@ -101,6 +102,10 @@ pub async fn uploads(store: &dyn Store) {
     assert!(store.uploads().await.unwrap().is_empty());
     store.create_upload(&upload, None, at(0)).await.unwrap();
     assert!(!store.delete_upload(SurveyId(Uuid::nil()), id).await.unwrap());
+    assert!(store.delete_upload(survey.id, id).await.unwrap());
+    upload.parts = Some("final;/a /b".to_owned());
+    store.create_upload(&Upload { outcome: None, ..upload.clone() }, None, at(0)).await.unwrap();
+    assert_eq!(store.upload(survey.id, id).await.unwrap().unwrap().parts, upload.parts);
     assert!(store.delete_upload(survey.id, id).await.unwrap());
     upload.survey = SurveyId(Uuid::nil());
     assert!(matches!(store.create_upload(&upload, None, at(0)).await, Err(StoreError::Gone { what: "survey" })));

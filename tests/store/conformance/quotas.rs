@@ -46,6 +46,7 @@ pub async fn quotas(store: &dyn Store) {
         length,
         received: 0,
         partial: false,
+        parts: None,
         metadata: String::new(),
         expires: at(expires),
         outcome: outcome.then(|| "{}".to_owned()),
