@@ -7,7 +7,11 @@ use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use serde_json::{Map, Value};
 use std::borrow::Cow;
-use utoipa::openapi::{OpenApi, RefOr, Schema};
+use std::collections::{BTreeMap, BTreeSet};
+use utoipa::openapi::header::HeaderBuilder;
+use utoipa::openapi::path::Operation;
+use utoipa::openapi::schema::{ObjectBuilder, Type};
+use utoipa::openapi::{ContentBuilder, OpenApi, PathItem, Ref, RefOr, ResponseBuilder, Schema};
 
 /// The media type of a problem document.
 pub const PROBLEM_JSON: &str = "application/problem+json";
@@ -15,7 +19,7 @@ pub const PROBLEM_JSON: &str = "application/problem+json";
 macro_rules! codes {
     ($($(#[$doc:meta])* $name:ident = $status:ident, $code:literal, $title:literal;)*) => {
         /// Every kind of problem, with its status, its stable word and its title.
-        #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
         pub enum Code {
             $($(#[$doc])* $name,)*
         }
@@ -235,13 +239,94 @@ pub struct Problem {
     pub detail: String,
 }
 
-/// Names every code in the description.
+/// Names every code in the description, and of each operation every status with the codes that it comes with: what the
+/// operation itself says under `4XX`, and what any operation may answer.
 pub fn describe(description: &mut OpenApi) {
     let problem = description.components.as_mut().and_then(|components| components.schemas.get_mut("Problem"));
     if let Some(RefOr::T(Schema::Object(problem))) = problem
         && let Some(RefOr::T(Schema::Object(code))) = problem.properties.get_mut("code")
     {
         code.enum_values = Some(Code::ALL.iter().map(|code| code.parts().1.into()).collect());
+    }
+    // What operations say of themselves, by their path and method.
+    let mut own: BTreeMap<(String, &str), String> = BTreeMap::new();
+    for (path, item) in &mut description.paths.paths {
+        for (method, operation) in operations(item) {
+            if let Some(RefOr::T(said)) = operation.responses.responses.remove("4XX") {
+                own.insert((path.clone(), method), said.description);
+            }
+        }
+    }
+    for (path, item) in &mut description.paths.paths {
+        for (method, operation) in operations(item) {
+            let said = own.get(&(path.clone(), method)).map_or("", String::as_str);
+            let mut codes = named(said);
+            for ((other, other_method), text) in &own {
+                // "As `PUT`": of the same path, or of the survey's files where this is their upload in steps.
+                let meant = match (said.contains("s `PUT`"), said.contains("As the method")) {
+                    (true, _) => *other_method == "put" && (other == path || !own.contains_key(&(path.clone(), "put"))),
+                    (_, stands) => stands && other == path,
+                };
+                if meant {
+                    codes.extend(named(text));
+                }
+            }
+            codes.extend([Code::Internal, Code::NotAcceptable]);
+            if path.contains('{') {
+                codes.insert(Code::NotFound);
+            }
+            if method == "post" || method == "put" || method == "patch" {
+                codes.extend([Code::UnsupportedMediaType, Code::TooLarge, Code::BadRequest]);
+            }
+            if !codes.contains(&Code::UploadStalled) {
+                codes.insert(Code::Timeout);
+            }
+            answer_with(operation, &codes, method == "head");
+        }
+    }
+}
+
+fn operations(item: &mut PathItem) -> impl Iterator<Item = (&'static str, &mut Operation)> {
+    let PathItem { get, put, post, delete, patch, head, .. } = item;
+    [("get", get), ("put", put), ("post", post), ("delete", delete), ("patch", patch), ("head", head)]
+        .into_iter()
+        .filter_map(|(method, operation)| Some((method, operation.as_mut()?)))
+}
+
+/// The codes that a text names in backticks.
+fn named(text: &str) -> BTreeSet<Code> {
+    let words: BTreeSet<&str> = text.split('`').skip(1).step_by(2).collect();
+    Code::ALL.iter().copied().filter(|code| words.contains(code.parts().1)).collect()
+}
+
+/// Describes the answers of these codes, each under its status; what is described there already is added to.
+fn answer_with(operation: &mut Operation, codes: &BTreeSet<Code>, without_body: bool) {
+    let responses = &mut operation.responses.responses;
+    for code in codes {
+        let (status, word, title) = code.parts();
+        let entry = responses.entry(status.as_u16().to_string()).or_insert_with(|| {
+            let content = ContentBuilder::new().schema(Some(Ref::from_schema_name("Problem"))).build();
+            match without_body {
+                true => ResponseBuilder::new().build().into(),
+                false => ResponseBuilder::new().content(PROBLEM_JSON, content).build().into(),
+            }
+        });
+        let RefOr::T(response) = entry else { continue };
+        if named(&response.description).contains(code) {
+            continue;
+        }
+        if !response.description.is_empty() {
+            response.description.push_str("; ");
+        }
+        response.description.push_str(&format!("`{word}`: {title}"));
+    }
+    for (status, response) in responses {
+        if let ("429" | "503" | "507", RefOr::T(response)) = (status.as_str(), response) {
+            let seconds = ObjectBuilder::new().schema_type(Type::Integer).minimum(Some(0)).build();
+            let header =
+                HeaderBuilder::new().schema(Some(seconds)).description(Some("Seconds until the next try")).build();
+            response.headers.insert("retry-after".to_owned(), header.into());
+        }
     }
 }
 

@@ -61,6 +61,64 @@ async fn real_answers_are_as_described() {
     validate(&description, "UploadedFile", &app.put(&format!("{survey}/images/a.jpg"), crate::app::jpeg(8, 8)).await.1);
 }
 
+#[test]
+fn every_operation_tells_its_problems_by_their_status() {
+    let description = serde_json::to_value(openapi()).unwrap();
+    for (path, operations) in description["paths"].as_object().unwrap() {
+        for (method, operation) in operations.as_object().unwrap().iter().filter(|(method, _)| *method != "options") {
+            let responses = operation["responses"].as_object().unwrap();
+            assert!(responses.keys().all(|status| status.parse::<u16>().is_ok()), "{method} {path}");
+            for (status, code) in [("500", "internal_error"), ("406", "not_acceptable")] {
+                let told = responses[status]["description"].as_str().unwrap();
+                assert!(told.contains(&format!("`{code}`")), "{method} {path} {status}: {told}");
+            }
+            if responses.contains_key("429") {
+                assert!(responses["429"]["headers"]["retry-after"].is_object(), "{method} {path}");
+            }
+        }
+    }
+}
+
+#[tokio::test]
+async fn real_problems_are_as_described() {
+    let description = serde_json::to_value(openapi()).unwrap();
+    let app = App::new(&[Act::Map(2)]).await;
+    let survey = app.complete_survey().await;
+    let job = app.map(&survey).await;
+    let plant = plant_path(&survey).to_owned();
+    let job = format!("{plant}/jobs/{}", job["id"].as_str().unwrap());
+    let nowhere = format!("{plant}/surveys/{}", uuid::Uuid::nil());
+    let (plants, one, surveys) =
+        ("/api/v1/plants", "/api/v1/plants/{plant}", "/api/v1/plants/{plant}/surveys/{survey}");
+    let of = |path: &str, rest: &str| format!("{path}{rest}");
+    for (method, template, path, body, code) in [
+        ("get", of(plants, ""), format!("{plants}?limit=0"), "", "invalid_query"),
+        ("post", of(plants, ""), plants.to_owned(), "{", "invalid_json"),
+        ("post", of(plants, ""), plants.to_owned(), "{\"name\": \"\"}", "invalid_name"),
+        ("get", of(one, ""), format!("{plants}/{}", uuid::Uuid::nil()), "", "plant_not_found"),
+        ("get", of(surveys, ""), nowhere.clone(), "", "survey_not_found"),
+        ("post", of(surveys, "/jobs"), format!("{nowhere}/jobs"), "{}", "survey_not_found"),
+        ("post", of(one, "/jobs/{job}/cancel"), format!("{job}/cancel"), "", "job_finished"),
+        ("put", of(surveys, "/images/{name}"), format!("{survey}/images/x.jpg"), "no photo", "image_unreadable"),
+        ("put", of(surveys, "/images/{name}"), format!("{survey}/images/x.exe"), "x", "invalid_name"),
+        ("put", of(surveys, "/reconstruction"), format!("{survey}/reconstruction"), "x", "unsupported_archive"),
+        ("post", of(surveys, "/reconstruction"), format!("{survey}/reconstruction"), "x", "unsupported_archive"),
+        ("put", of(surveys, "/reconstruction/{path}"), format!("{survey}/reconstruction/x"), "x", "unknown_file"),
+        ("post", of(surveys, "/uploads"), format!("{survey}/uploads"), "", "tus_version"),
+        ("get", of(one, "/models/{version}/{layer}"), format!("{plant}/models/9/modules"), "", "model_not_found"),
+        ("get", of(one, "/modules/{module}"), format!("{plant}/modules/{}", uuid::Uuid::nil()), "", "module_not_found"),
+        ("get", of(one, "/modules/{module}"), format!("{plant}/modules/x"), "", "not_found"),
+    ] {
+        let request = app.request(Method::from_bytes(method.to_uppercase().as_bytes()).unwrap(), &path);
+        let request = request.header("content-type", "application/json").body(body);
+        let (status, problem) = crate::app::json_of(request.send().await.unwrap()).await;
+        assert_eq!(problem["code"], code, "{method} {path}: {problem}");
+        validate(&description, "Problem", &problem);
+        let told = &description["paths"][&template][method]["responses"][status.as_str()]["description"];
+        assert!(told.as_str().is_some_and(|told| told.contains(&format!("`{code}`"))), "{method} {template}: {told}");
+    }
+}
+
 #[tokio::test]
 async fn the_service_describes_itself() {
     let app = App::new(&[]).await;
