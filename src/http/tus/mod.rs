@@ -326,7 +326,7 @@ async fn end(state: &AppState, path: &UploadPath, headers: &HeaderMap) -> Result
     request_body(content = Vec<u8>, content_type = "application/offset+octet-stream", description = "The bytes"),
     responses(
         (status = 204, description = "As the method that it stands for"),
-        (status = "4XX", description = "As the method that it stands for", body = Problem,
+        (status = "4XX", description = "As the method that it stands for; `method_not_allowed`", body = Problem,
             content_type = "application/problem+json")
     )
 )]
