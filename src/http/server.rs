@@ -1,12 +1,13 @@
 //! Connections, within bounds of number and time: who sends nothing, or takes nothing of what is sent, is let go.
 
+use super::rates::network;
 use crate::config::Limits;
 use axum::Router;
 use hyper::server::conn::http1;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::server::graceful::GracefulShutdown;
 use std::collections::HashMap;
-use std::net::{IpAddr, Ipv6Addr, SocketAddr};
+use std::net::{IpAddr, SocketAddr};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 use tokio::net::{TcpListener, TcpStream};
@@ -29,9 +30,9 @@ pub struct Peer(pub SocketAddr);
 
 /// Serves until `stop`, then ends the requests that are being answered, and returns.
 ///
-/// A connection is closed whose first byte does not come within 10 s, whose next request's head is not whole within `limits.request_timeout`, or whose client takes
-/// nothing of an answer for so long. Beyond `limits.max_connections` new ones wait; beyond
-/// `limits.max_connections_per_address` those of one address are closed.
+/// A connection is closed whose first byte does not come within 10 s, whose next request's head is not whole within
+/// `limits.request_timeout`, or whose client takes nothing of an answer for so long. Beyond `limits.max_connections` new
+/// ones wait; beyond `limits.max_connections_per_address` those of one address are closed.
 pub async fn serve(listener: TcpListener, router: Router, limits: &Limits, stop: CancellationToken) {
     let graceful = GracefulShutdown::new();
     let room = Arc::new(Semaphore::new(limits.max_connections));
@@ -126,14 +127,6 @@ impl Drop for One {
                 counts.remove(&self.network);
             }
         }
-    }
-}
-
-/// Whose an address is: with IPv6, one machine has a whole /64.
-fn network(address: IpAddr) -> IpAddr {
-    match address.to_canonical() {
-        IpAddr::V4(address) => address.into(),
-        IpAddr::V6(address) => Ipv6Addr::from_bits(address.to_bits() >> 64 << 64).into(),
     }
 }
 
