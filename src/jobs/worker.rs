@@ -173,6 +173,20 @@ impl Worker {
         }
     }
 
+    /// Holds on to a job whose model is being stored, however long that takes; comes back where the job was cancelled.
+    async fn hold_until_cancelled(&self, claim: &Claim, watch: &Watch) {
+        loop {
+            tokio::time::sleep(self.settings.heartbeat).await;
+            match self.store.heartbeat(claim, watch.progress(), self.settings.lease, Timestamp::now()).await {
+                Ok(Heartbeat::Continue) => {}
+                Ok(Heartbeat::Cancel) => return,
+                // Whether that is because the model is stored, its storing tells.
+                Ok(Heartbeat::Lost) => std::future::pending().await,
+                Err(error) => tracing::warn!(%error, "heartbeat failed"),
+            }
+        }
+    }
+
     /// Stores what was found since the last time. What cannot be stored is found again where the job is taken up again.
     async fn keep(&self, claim: &Claim, watch: &Watch) {
         let (fingerprint, found) = watch.take_found();
@@ -272,17 +286,22 @@ impl Worker {
             }
             (Ok(model), _) => {
                 let _ = self.store.heartbeat(claim, watch.progress(), self.settings.lease, now).await?;
-                match self.store.complete_job(claim, &model, now).await? {
-                    Completed::Done(model) => {
+                let completed = tokio::select! {
+                    completed = self.store.complete_job(claim, &model, now) => Some(completed?),
+                    () = self.hold_until_cancelled(claim, watch) => None,
+                };
+                match completed {
+                    None => Ending::Cancelled,
+                    Some(Completed::Done(model)) => {
                         self.count("succeeded");
                         tracing::info!(version = model.version, "model stored");
                         return Ok(());
                     }
-                    Completed::Fenced => {
+                    Some(Completed::Fenced) => {
                         tracing::warn!("the job is in other hands or gone; its result is dropped");
                         return Ok(());
                     }
-                    Completed::Outdated => Ending::Retry {
+                    Some(Completed::Outdated) => Ending::Retry {
                         code: "outdated".to_owned(),
                         message: "the plant got another model meanwhile; the survey is mapped again".to_owned(),
                         at: now,

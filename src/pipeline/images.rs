@@ -152,10 +152,12 @@ pub(super) fn search(
                 let name = sought[image].image.clone();
                 return Some(pixels.map(|pixels| Loaded { key: image, image: name, pixels, gsd_m: gsd_m[shot] }));
             }
-            Turn::Found(image, found) => {
+            // What was found twice counts once.
+            Turn::Found(image, found) if left.contains(&image) => {
                 left.retain(|other| *other != image);
                 keep(image, *found);
             }
+            Turn::Found(..) => {}
             Turn::Wait => std::thread::sleep(WAIT_FOR_OTHERS),
         }
     };

@@ -5,6 +5,7 @@ mod backend;
 
 use super::StoreError;
 use super::schema::Examined;
+use super::sql::postgres as queues;
 use sqlx::postgres::{PgListener, PgPool, PgPoolOptions};
 use sqlx::{Postgres, Transaction};
 use std::time::Duration;

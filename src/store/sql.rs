@@ -294,14 +294,7 @@ pub const RESEND_DELIVERY: &str = concat!(
     delivery!()
 );
 pub const DELIVERY_DUE: &str = "SELECT 1 FROM deliveries WHERE state = 'waiting' AND run_after_ms <= $1 LIMIT 1";
-/// The condition stands twice: a second process that waited for the first one's row looks at it again.
-pub const CLAIM_DELIVERY: &str = concat!(
-    "UPDATE deliveries SET attempts = attempts + 1, attempts_left = attempts_left - 1, run_after_ms = $2 \
-     WHERE state = 'waiting' AND run_after_ms <= $1 AND seq = (SELECT due.seq FROM deliveries AS due \
-     WHERE due.state = 'waiting' AND due.run_after_ms <= $1 ORDER BY due.run_after_ms, due.seq LIMIT 1) RETURNING ",
-    delivery!()
-);
-pub const WEBHOOK_OF_DELIVERY: &str = "SELECT url, secret FROM webhooks WHERE id = $1";
+pub const WEBHOOK_OF_DELIVERY: &str = "SELECT organisation_id, url, secret FROM webhooks WHERE id = $1";
 pub const JOB_OF_DELIVERY: &str = concat!("SELECT ", job!(), " FROM jobs WHERE id = $1");
 /// `$2` the attempt, `$3` the state, `$4` what failed, `$5` the time from which to try again, `$6` the time of the end.
 pub const END_DELIVERY: &str = "\
@@ -338,28 +331,88 @@ pub const CANCEL_JOB: &str = concat!(
 );
 
 pub const JOBS_BY_STATE: &str = "SELECT state, COUNT(*) AS jobs FROM jobs GROUP BY state";
-pub const QUEUE: &str = "\
-    SELECT COUNT(*) AS waiting, MIN(run_after_ms) AS since_ms FROM jobs WHERE state = 'queued' AND run_after_ms <= $1";
 
-/// Ends jobs whose worker fell silent and that were cancelled or had their last attempt.
-pub const BURY_ABANDONED_JOBS: &str = "\
-    UPDATE jobs SET finished_ms = $1, lease_until_ms = NULL, \
-    error_code = CASE WHEN cancel_requested THEN error_code ELSE 'worker_lost' END, \
-    error_message = CASE WHEN cancel_requested THEN error_message ELSE $2 END, \
-    state = CASE WHEN cancel_requested THEN 'cancelled' ELSE 'failed' END \
-    WHERE state = 'running' AND lease_until_ms < $1 AND (cancel_requested OR attempt - attempts_before >= max_attempts) \
-    RETURNING id";
-pub const CLAIM_JOB: &str = concat!(
-    "UPDATE jobs SET state = 'running', worker = $1, attempt = attempt + 1, fence = fence + 1, lease_until_ms = $3, \
-     started_ms = COALESCE(started_ms, $2), stage = NULL, done = 0, total = 0, remaining_ms = NULL \
-     WHERE seq = (SELECT candidate.seq FROM jobs AS candidate \
-     WHERE ((candidate.state = 'queued' AND candidate.run_after_ms <= $2) \
-     OR (candidate.state = 'running' AND candidate.lease_until_ms < $2)) \
-     AND NOT EXISTS (SELECT 1 FROM jobs AS other WHERE other.plant_id = candidate.plant_id \
-     AND other.seq <> candidate.seq AND other.state = 'running' AND other.lease_until_ms >= $2) \
-     ORDER BY candidate.priority DESC, candidate.seq LIMIT 1) RETURNING ",
-    job!()
-);
+/// How many plants have a job that a worker may claim, as [`postgres::CLAIM_JOB`] does, and since when the oldest may be.
+pub const QUEUE: &str = "\
+    SELECT COUNT(DISTINCT plant_id) AS waiting, MIN(run_after_ms) AS since_ms FROM jobs AS candidate \
+    WHERE ((state = 'queued' AND run_after_ms <= $1) OR (state = 'running' AND lease_until_ms < $1)) \
+    AND NOT EXISTS (SELECT 1 FROM jobs AS other WHERE other.plant_id = candidate.plant_id \
+    AND other.seq <> candidate.seq AND other.state = 'running' AND other.lease_until_ms >= $1)";
+
+/// Statements that take a row of a queue. What they ask of the row stands twice: where another transaction had the row
+/// when it was chosen, it may be another's since. Where there may be such transactions, `$skip` passes over their rows
+/// instead of waiting for them.
+macro_rules! queues {
+    ($database:ident, $skip:literal) => {
+        pub mod $database {
+            /// Ends jobs whose worker fell silent and that were cancelled or had their last attempt.
+            pub const BURY_ABANDONED_JOBS: &str = concat!(
+                "UPDATE jobs SET finished_ms = $1, lease_until_ms = NULL, \
+                 error_code = CASE WHEN cancel_requested THEN error_code ELSE 'worker_lost' END, \
+                 error_message = CASE WHEN cancel_requested THEN error_message ELSE $2 END, \
+                 state = CASE WHEN cancel_requested THEN 'cancelled' ELSE 'failed' END \
+                 WHERE state = 'running' AND lease_until_ms < $1 \
+                 AND (cancel_requested OR attempt - attempts_before >= max_attempts) \
+                 AND seq IN (SELECT candidate.seq FROM jobs AS candidate \
+                 WHERE candidate.state = 'running' AND candidate.lease_until_ms < $1",
+                $skip,
+                ") RETURNING id"
+            );
+            pub const CLAIM_JOB: &str = concat!(
+                "UPDATE jobs SET state = 'running', worker = $1, attempt = attempt + 1, fence = fence + 1, \
+                 lease_until_ms = $3, started_ms = COALESCE(started_ms, $2), stage = NULL, done = 0, total = 0, \
+                 remaining_ms = NULL \
+                 WHERE ((state = 'queued' AND run_after_ms <= $2) OR (state = 'running' AND lease_until_ms < $2)) \
+                 AND seq = (SELECT candidate.seq FROM jobs AS candidate \
+                 WHERE ((candidate.state = 'queued' AND candidate.run_after_ms <= $2) \
+                 OR (candidate.state = 'running' AND candidate.lease_until_ms < $2)) \
+                 AND NOT EXISTS (SELECT 1 FROM jobs AS other WHERE other.plant_id = candidate.plant_id \
+                 AND other.seq <> candidate.seq AND other.state = 'running' AND other.lease_until_ms >= $2) \
+                 ORDER BY candidate.priority DESC, candidate.seq LIMIT 1",
+                $skip,
+                ") RETURNING ",
+                job!()
+            );
+            /// The job's own worker has it for as long as it has the job: `$4` is the end of time.
+            pub const TAKE_OWN_TASK: &str = concat!(
+                "UPDATE image_tasks SET token = NULL, lease_until_ms = $4 \
+                 WHERE job_id = $1 AND NOT done AND lease_until_ms < $3 AND image = (\
+                 SELECT candidate.image FROM image_tasks AS candidate \
+                 WHERE candidate.job_id = $1 AND NOT candidate.done AND candidate.lease_until_ms < $3 \
+                 ORDER BY candidate.position LIMIT 1",
+                $skip,
+                ") AND EXISTS (SELECT 1 FROM jobs WHERE id = $1 AND fence = $2 AND state = 'running') RETURNING image"
+            );
+            pub const TAKE_TASK: &str = concat!(
+                "UPDATE image_tasks SET token = $3, lease_until_ms = $4 \
+                 WHERE NOT done AND NOT left_to_owner AND lease_until_ms < $2 AND (job_id, image) = (\
+                 SELECT candidate.job_id, candidate.image \
+                 FROM image_tasks AS candidate JOIN jobs ON jobs.id = candidate.job_id \
+                 WHERE candidate.mapper = $1 AND NOT candidate.done AND NOT candidate.left_to_owner \
+                 AND candidate.lease_until_ms < $2 AND jobs.state = 'running' AND NOT jobs.cancel_requested \
+                 ORDER BY jobs.priority DESC, jobs.seq, candidate.position LIMIT 1",
+                $skip,
+                ") RETURNING job_id, image, document, \
+                 (SELECT plant_id FROM jobs WHERE jobs.id = image_tasks.job_id) AS plant_id"
+            );
+            /// Of the webhooks of organisations that are not in the text `$3`.
+            pub const CLAIM_DELIVERY: &str = concat!(
+                "UPDATE deliveries SET attempts = attempts + 1, attempts_left = attempts_left - 1, run_after_ms = $2 \
+                 WHERE state = 'waiting' AND run_after_ms <= $1 AND seq = (SELECT candidate.seq \
+                 FROM deliveries AS candidate JOIN webhooks ON webhooks.id = candidate.webhook_id \
+                 WHERE candidate.state = 'waiting' AND candidate.run_after_ms <= $1 \
+                 AND $3 NOT LIKE '%' || webhooks.organisation_id || '%' \
+                 ORDER BY candidate.run_after_ms, candidate.seq LIMIT 1",
+                $skip,
+                ") RETURNING ",
+                delivery!()
+            );
+        }
+    };
+}
+queues!(sqlite, "");
+queues!(postgres, " FOR NO KEY UPDATE OF candidate SKIP LOCKED");
+
 pub const HEARTBEAT: &str = "\
     UPDATE jobs SET lease_until_ms = $3, stage = COALESCE($4, stage), done = COALESCE($5, done), \
     total = COALESCE($6, total), remaining_ms = CASE WHEN $4 IS NULL THEN remaining_ms ELSE $7 END \
@@ -372,19 +425,13 @@ pub const CHECKPOINT: &str = "\
 pub const CHECKPOINTS: &str =
     "SELECT name, document FROM checkpoints WHERE job_id = $1 AND fingerprint = $2 ORDER BY name";
 pub const SWEEP_CHECKPOINTS: &str = "\
-    DELETE FROM checkpoints WHERE NOT EXISTS (SELECT 1 FROM jobs WHERE jobs.id = checkpoints.job_id \
-    AND jobs.state IN ('queued', 'running'))";
+    DELETE FROM checkpoints WHERE job_id = $1 \
+    AND NOT EXISTS (SELECT 1 FROM jobs WHERE jobs.id = $1 AND jobs.state IN ('queued', 'running'))";
 
 pub const IS_CLAIMED: &str = "SELECT 1 FROM jobs WHERE id = $1 AND fence = $2 AND state = 'running'";
 pub const WITHDRAW_TASKS: &str = "DELETE FROM image_tasks WHERE job_id = $1";
-pub const OFFER_TASK: &str = "\
-    INSERT INTO image_tasks (job_id, image, position, fingerprint, mapper, document) VALUES ($1, $2, $3, $4, $5, $6)";
-/// The job's own worker has it for as long as it has the job: `$4` is the end of time.
-pub const TAKE_OWN_TASK: &str = "\
-    UPDATE image_tasks SET token = NULL, lease_until_ms = $4 WHERE job_id = $1 AND image = (\
-        SELECT free.image FROM image_tasks AS free \
-        WHERE free.job_id = $1 AND NOT free.done AND free.lease_until_ms < $3 ORDER BY free.position LIMIT 1\
-    ) AND EXISTS (SELECT 1 FROM jobs WHERE id = $1 AND fence = $2 AND state = 'running') RETURNING image";
+/// Rows follow, as many as one statement may have.
+pub const OFFER_TASKS: &str = "INSERT INTO image_tasks (job_id, image, position, fingerprint, mapper, document) ";
 pub const TASK_IN_OTHER_HANDS: &str =
     "SELECT 1 FROM image_tasks WHERE job_id = $1 AND (done OR lease_until_ms < $2) LIMIT 1";
 pub const DONE_TASK: &str = "SELECT 1 FROM image_tasks WHERE job_id = $1 AND done LIMIT 1";
@@ -396,26 +443,21 @@ pub const WAITING_TASKS: &str = "\
     SELECT COUNT(*) FROM image_tasks WHERE NOT done AND NOT left_to_owner AND lease_until_ms < $1 \
     AND EXISTS (SELECT 1 FROM jobs WHERE jobs.id = image_tasks.job_id AND jobs.state = 'running' \
     AND NOT jobs.cancel_requested)";
-pub const TAKE_TASK: &str = "\
-    UPDATE image_tasks SET token = $3, lease_until_ms = $4 WHERE (job_id, image) = (\
-        SELECT free.job_id, free.image FROM image_tasks AS free JOIN jobs ON jobs.id = free.job_id \
-        WHERE free.mapper = $1 AND NOT free.done AND NOT free.left_to_owner AND free.lease_until_ms < $2 \
-        AND jobs.state = 'running' AND NOT jobs.cancel_requested \
-        ORDER BY jobs.priority DESC, jobs.seq, free.position LIMIT 1\
-    ) RETURNING job_id, image, document, (SELECT plant_id FROM jobs WHERE jobs.id = image_tasks.job_id) AS plant_id";
 pub const EXTEND_TASK: &str = "\
     UPDATE image_tasks SET lease_until_ms = $2 WHERE token = $1 AND EXISTS (SELECT 1 FROM jobs \
     WHERE jobs.id = image_tasks.job_id AND jobs.state = 'running' AND NOT jobs.cancel_requested)";
+/// `$2` the token of one of the job's tasks.
+pub const OTHERS_MADE_PROGRESS: &str = "\
+    UPDATE jobs SET attempts_before = attempt - 1 WHERE id = $1 AND state = 'running' \
+    AND EXISTS (SELECT 1 FROM image_tasks WHERE token = $2)";
 pub const FINISH_TASK: &str = "\
     UPDATE image_tasks SET done = TRUE, token = NULL, lease_until_ms = $2 WHERE token = $1 RETURNING fingerprint";
-pub const OTHERS_MADE_PROGRESS: &str =
-    "UPDATE jobs SET attempts_before = attempt - 1 WHERE id = $1 AND state = 'running'";
 pub const GIVE_BACK_TASK: &str = "\
     UPDATE image_tasks SET token = NULL, lease_until_ms = 0, left_to_owner = (left_to_owner OR $2) WHERE token = $1";
 pub const FORGET_TASK: &str = "DELETE FROM image_tasks WHERE job_id = $1 AND image = $2";
 pub const SWEEP_TASKS: &str = "\
-    DELETE FROM image_tasks WHERE NOT EXISTS (SELECT 1 FROM jobs WHERE jobs.id = image_tasks.job_id \
-    AND jobs.state IN ('queued', 'running'))";
+    DELETE FROM image_tasks WHERE job_id = $1 \
+    AND NOT EXISTS (SELECT 1 FROM jobs WHERE jobs.id = $1 AND jobs.state IN ('queued', 'running'))";
 
 pub const ATTEMPTS_USED: &str =
     "SELECT attempt - attempts_before FROM jobs WHERE id = $1 AND fence = $2 AND state = 'running'";

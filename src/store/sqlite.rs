@@ -6,6 +6,7 @@ mod backend;
 use super::StoreError;
 use super::blobs::io;
 use super::schema::Examined;
+use super::sql::sqlite as queues;
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePool, SqlitePoolOptions, SqliteSynchronous};
 use sqlx::{Sqlite, Transaction};
 use std::path::Path;

@@ -141,6 +141,8 @@ pub struct Delivery {
 /// A message in the hands of whoever sends it.
 #[derive(Clone)]
 pub struct DeliveryClaim {
+    /// Whose webhook it goes to.
+    pub organisation: OrganisationId,
     pub delivery: Delivery,
     pub url: String,
     pub secret: SigningSecret,
@@ -185,9 +187,14 @@ pub trait WebhookStore: Send + Sync + 'static {
         now: Timestamp,
     ) -> Result<Option<Delivery>, StoreError>;
 
-    /// Takes the message that is due for the longest time. Where it is not said within `lease` what became of it, it is
-    /// taken again.
-    async fn claim_delivery(&self, lease: Duration, now: Timestamp) -> Result<Option<DeliveryClaim>, StoreError>;
+    /// Takes the message that is due for the longest time, those to webhooks of `busy` organisations apart. Where it is not
+    /// said within `lease` what became of it, it is taken again.
+    async fn claim_delivery(
+        &self,
+        busy: &[OrganisationId],
+        lease: Duration,
+        now: Timestamp,
+    ) -> Result<Option<DeliveryClaim>, StoreError>;
     /// Notes what became of a message; `false` where it was taken again, or is gone.
     async fn end_delivery(&self, claim: &DeliveryClaim, sent: &Sent, now: Timestamp) -> Result<bool, StoreError>;
     /// Forgets messages that arrived, or were given up, before a time.

@@ -2,18 +2,21 @@
 //! at once and none is lost with the process that had it.
 
 use super::{HEADER, Message, Targets, sign};
-use crate::store::{DeliveryClaim, Sent, Store};
+use crate::store::{DeliveryClaim, OrganisationId, Sent, Store};
 use crate::telemetry::Metrics;
 use crate::telemetry::metrics::OutcomeLabels;
 use jiff::Timestamp;
 use reqwest::{Client, redirect};
+use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 
 /// How many messages one process sends at once.
-const AT_ONCE: usize = 8;
+const AT_ONCE: usize = 32;
+/// How many of these to webhooks of one organisation, whose slow receivers keep nobody else waiting.
+const AT_ONCE_OF_ONE: usize = 2;
 /// The longest time between two tries.
 const LONGEST_PAUSE: Duration = Duration::from_secs(6 * 3600);
 
@@ -77,12 +80,20 @@ impl Sender {
     /// Sends what is due until `stop`; what is being sent then may end.
     pub async fn run(&self, stop: CancellationToken) {
         let mut sending = JoinSet::new();
+        let mut of: HashMap<OrganisationId, usize> = HashMap::new();
         while !stop.is_cancelled() {
             while sending.len() < AT_ONCE {
-                match self.store.claim_delivery(self.settings.lease, Timestamp::now()).await {
+                let busy =
+                    of.iter().filter(|(_, count)| **count >= AT_ONCE_OF_ONE).map(|(organisation, _)| *organisation);
+                let busy: Vec<_> = busy.collect();
+                match self.store.claim_delivery(&busy, self.settings.lease, Timestamp::now()).await {
                     Ok(Some(claim)) => {
-                        let sender = self.clone();
-                        sending.spawn(async move { sender.deliver(claim).await });
+                        let (sender, organisation) = (self.clone(), claim.organisation);
+                        *of.entry(organisation).or_default() += 1;
+                        sending.spawn(async move {
+                            sender.deliver(claim).await;
+                            organisation
+                        });
                     }
                     Ok(None) => break,
                     Err(error) => {
@@ -93,7 +104,18 @@ impl Sender {
             }
             tokio::select! {
                 () = stop.cancelled() => {}
-                Some(_) = sending.join_next() => {}
+                Some(sent) = sending.join_next() => match sent {
+                    Ok(organisation) => {
+                        let left = of.remove(&organisation).unwrap_or_default().saturating_sub(1);
+                        of.extend((left > 0).then_some((organisation, left)));
+                    }
+                    // Nothing is known of whose it was.
+                    Err(error) => {
+                        tracing::error!(%error, "a message to a webhook was not sent");
+                        while sending.join_next().await.is_some() {}
+                        of.clear();
+                    }
+                },
                 () = tokio::time::sleep(self.settings.poll) => {}
             }
         }

@@ -1,6 +1,7 @@
 //! The suite. Times are given, so nothing waits.
 
 mod access;
+pub mod contention;
 mod files;
 mod freeing;
 mod jobs;

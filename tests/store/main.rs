@@ -32,13 +32,18 @@ macro_rules! on_both {
 
 /// A store in a new database of the server that `tests/with-postgres.sh` started for the tests.
 async fn postgres_store() -> PostgresStore {
+    PostgresStore::open(&postgres_database().await).await.unwrap()
+}
+
+/// The URL of a new database of that server.
+async fn postgres_database() -> String {
     let server = std::env::var("HELIOMAP_TEST_POSTGRES")
         .expect("tests need a Postgres server: run `make unit`, or tests/with-postgres.sh before cargo test");
     let name = format!("test_{}", uuid::Uuid::new_v4().simple());
     let pool = sqlx::PgPool::connect(&format!("{server}/postgres")).await.unwrap();
     sqlx::query(sqlx::AssertSqlSafe(format!("CREATE DATABASE {name}"))).execute(&pool).await.unwrap();
     pool.close().await;
-    PostgresStore::open(&format!("{server}/{name}")).await.unwrap()
+    format!("{server}/{name}")
 }
 
 on_both!(
@@ -71,6 +76,7 @@ on_both!(
     lists_are_filtered,
     webhooks,
     messages_are_sent_by_one_at_a_time_and_not_for_ever,
+    messages_of_a_busy_organisation_keep_no_other_waiting,
     blobs_that_rows_name,
     what_nothing_names_any_more_is_freed,
     bytes_that_come_again_are_kept,
@@ -87,6 +93,31 @@ on_both!(
 async fn postgres_rings_for_work() {
     conformance::work_is_told(&postgres_store().await).await;
 }
+
+/// What happens where transactions meet.
+macro_rules! on_postgres {
+    ($($name:ident),* $(,)?) => {
+        mod contention {
+            $(
+                #[tokio::test]
+                async fn $name() {
+                    let database = super::postgres_database().await;
+                    let store = super::PostgresStore::open(&database).await.unwrap();
+                    let pool = sqlx::PgPool::connect(&database).await.unwrap();
+                    super::conformance::contention::$name(&store, &pool).await;
+                }
+            )*
+        }
+    };
+}
+
+on_postgres!(
+    a_job_that_is_just_ending_is_not_claimed_again,
+    a_job_that_is_just_cancelled_is_not_claimed,
+    an_image_that_is_just_found_is_not_taken_again,
+    heartbeats_go_on_while_a_model_is_stored,
+    an_image_that_is_found_as_its_job_ends_holds_up_neither,
+);
 
 /// A data folder of before there were organisations keeps all that it holds.
 #[tokio::test]

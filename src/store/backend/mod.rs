@@ -17,7 +17,7 @@ use super::super::{
     NewModel, OrganisationId, Page, Plant, Pool, Progress, Queue, Quotas, Store, StoreError, Survey, SurveyId,
     SurveyPath, TaskStore, Wanted,
 };
-use super::{Db, Row, Rows, Tx, tell_of_work};
+use super::{Db, Row, Rows, Tx, queues, tell_of_work};
 use crate::plant::{Layer, ModuleId, PlantId};
 use async_trait::async_trait;
 use jiff::Timestamp;
@@ -291,7 +291,7 @@ impl Store for Rows {
         let row = query.bind(now.as_millisecond()).fetch_optional(&mut *tx).await?;
         let outcome = match row {
             Some(row) => {
-                sweep(&mut tx).await?;
+                sweep(&mut tx, id).await?;
                 let job = job(&row)?;
                 if job.state.is_final() {
                     announce(&mut tx, id, now).await?;
@@ -331,18 +331,17 @@ impl Store for Rows {
 
     async fn claim_job(&self, worker: &str, lease: Duration, now: Timestamp) -> Result<Option<Claim>, StoreError> {
         let mut tx = self.begin_alone().await?;
-        let buried = sqlx::query(sql::BURY_ABANDONED_JOBS)
+        let buried = sqlx::query(queues::BURY_ABANDONED_JOBS)
             .bind(now.as_millisecond())
             .bind("every worker that took this job fell silent; see the workers' logs, then start a new job")
             .fetch_all(&mut *tx)
             .await?;
-        if !buried.is_empty() {
-            sweep(&mut tx).await?;
-        }
         for row in &buried {
-            announce(&mut tx, JobId(read::uuid(row, "id")?), now).await?;
+            let job = JobId(read::uuid(row, "id")?);
+            sweep(&mut tx, job).await?;
+            announce(&mut tx, job, now).await?;
         }
-        let row = sqlx::query(sql::CLAIM_JOB)
+        let row = sqlx::query(queues::CLAIM_JOB)
             .bind(worker)
             .bind(now.as_millisecond())
             .bind(after(now, lease))
@@ -413,16 +412,8 @@ impl Store for Rows {
     async fn complete_job(&self, claim: &Claim, new: &NewModel, now: Timestamp) -> Result<Completed, StoreError> {
         let mut tx = self.begin().await?;
         let warnings = serde_json::json!(new.warnings).to_string();
-        let done = sqlx::query(sql::COMPLETE_JOB)
-            .bind(claim.job.id.to_string())
-            .bind(claim.fence)
-            .bind(now.as_millisecond())
-            .bind(&warnings)
-            .bind(i64::from(new.version))
-            .bind(&new.stage_ms)
-            .execute(&mut *tx)
-            .await?;
-        if done.rows_affected() == 0 {
+        let query = sqlx::query(sql::IS_CLAIMED).bind(claim.job.id.to_string()).bind(claim.fence);
+        if query.fetch_optional(&mut *tx).await?.is_none() {
             return Ok(Completed::Fenced);
         }
         let row = sqlx::query(sql::INSERT_MODEL)
@@ -462,9 +453,22 @@ impl Store for Rows {
                 first += features.len() as i64;
             }
         }
+        // Up to here the job's row was free for heartbeats.
+        let done = sqlx::query(sql::COMPLETE_JOB)
+            .bind(claim.job.id.to_string())
+            .bind(claim.fence)
+            .bind(now.as_millisecond())
+            .bind(&warnings)
+            .bind(i64::from(new.version))
+            .bind(&new.stage_ms)
+            .execute(&mut *tx)
+            .await?;
+        if done.rows_affected() == 0 {
+            return Ok(Completed::Fenced);
+        }
         // A model counts, and no quota keeps a job from its end. Those who upload to the plant wait from here on.
         usage::count_bytes(&mut tx, claim.job.plant, &[(new.sha256, new.size)], None).await?;
-        sweep(&mut tx).await?;
+        sweep(&mut tx, claim.job.id).await?;
         announce(&mut tx, claim.job.id, now).await?;
         tx.commit().await?;
         Ok(Completed::Done(Box::new(stored)))
@@ -503,7 +507,7 @@ impl Store for Rows {
         if matches!(ending, Ending::Released) {
             tell_of_work(&mut tx).await?;
         }
-        sweep(&mut tx).await?;
+        sweep(&mut tx, claim.job.id).await?;
         if finished_ms.is_some() {
             announce(&mut tx, claim.job.id, now).await?;
         }
@@ -592,10 +596,10 @@ impl Store for Rows {
     }
 }
 
-/// What ended jobs had found is in their models, or of no use; their images need no search.
-async fn sweep(tx: &mut Tx) -> Result<(), StoreError> {
+/// What a job had found is in its model, or of no use, once it has ended; its images need no search.
+async fn sweep(tx: &mut Tx, job: JobId) -> Result<(), StoreError> {
     for statement in [sql::SWEEP_CHECKPOINTS, sql::SWEEP_TASKS] {
-        sqlx::query(statement).execute(&mut **tx).await?;
+        sqlx::query(statement).bind(job.to_string()).execute(&mut **tx).await?;
     }
     Ok(())
 }

@@ -1,14 +1,17 @@
 //! Images of running jobs that other workers may search.
 
-use super::super::{Rows, tell_of_work};
+use super::super::{Db, Rows, queues, tell_of_work};
 use super::{after, read};
 use crate::plant::PlantId;
 use crate::store::{Checkpoint, Claim, GivenBack, ImageTask, JobId, OwnTask, StoreError, TaskClaim, TaskStore, sql};
 use async_trait::async_trait;
 use jiff::Timestamp;
-use sqlx::Row as _;
+use sqlx::{QueryBuilder, Row as _};
 use std::time::Duration;
 use uuid::Uuid;
+
+/// Tasks that one statement inserts; a row has six parameters.
+const TASKS_AT_ONCE: usize = 500;
 
 #[async_trait]
 impl TaskStore for Rows {
@@ -26,16 +29,18 @@ impl TaskStore for Rows {
             return Ok(false);
         }
         sqlx::query(sql::WITHDRAW_TASKS).bind(&job).execute(&mut *tx).await?;
-        for (position, task) in tasks.iter().enumerate() {
-            sqlx::query(sql::OFFER_TASK)
-                .bind(&job)
-                .bind(&task.image)
-                .bind(position as i64)
-                .bind(fingerprint)
-                .bind(mapper)
-                .bind(&task.document)
-                .execute(&mut *tx)
-                .await?;
+        let mut placed = (0_i64..).zip(tasks);
+        for chunk in tasks.chunks(TASKS_AT_ONCE) {
+            let mut insert = QueryBuilder::<Db>::new(sql::OFFER_TASKS);
+            insert.push_values(placed.by_ref().take(chunk.len()), |mut row, (position, task)| {
+                row.push_bind(&job)
+                    .push_bind(&task.image)
+                    .push_bind(position)
+                    .push_bind(fingerprint)
+                    .push_bind(mapper)
+                    .push_bind(&task.document);
+            });
+            insert.build().persistent(false).execute(&mut *tx).await?;
         }
         if !tasks.is_empty() {
             tell_of_work(&mut tx).await?;
@@ -47,7 +52,7 @@ impl TaskStore for Rows {
     async fn take_own_task(&self, claim: &Claim, now: Timestamp) -> Result<OwnTask, StoreError> {
         let mut tx = self.begin_alone().await?;
         let job = claim.job.id.to_string();
-        let image: Option<String> = sqlx::query_scalar(sql::TAKE_OWN_TASK)
+        let image: Option<String> = sqlx::query_scalar(queues::TAKE_OWN_TASK)
             .bind(&job)
             .bind(claim.fence)
             .bind(now.as_millisecond())
@@ -96,7 +101,7 @@ impl TaskStore for Rows {
     async fn take_task(&self, mapper: &str, lease: Duration, now: Timestamp) -> Result<Option<TaskClaim>, StoreError> {
         let mut tx = self.begin_alone().await?;
         let token = Uuid::new_v4();
-        let row = sqlx::query(sql::TAKE_TASK)
+        let row = sqlx::query(queues::TAKE_TASK)
             .bind(mapper)
             .bind(now.as_millisecond())
             .bind(token.to_string())
@@ -116,23 +121,27 @@ impl TaskStore for Rows {
     }
 
     async fn extend_tasks(&self, tokens: &[Uuid], lease: Duration, now: Timestamp) -> Result<Vec<Uuid>, StoreError> {
-        let mut tx = self.begin().await?;
+        // One by one: whoever deletes them at the end of their job has them in an order of its own.
         let mut held = Vec::with_capacity(tokens.len());
         for token in tokens {
             let query = sqlx::query(sql::EXTEND_TASK).bind(token.to_string()).bind(after(now, lease));
-            if query.execute(&mut *tx).await?.rows_affected() > 0 {
+            if query.execute(&self.write).await?.rows_affected() > 0 {
                 held.push(*token);
             }
         }
-        tx.commit().await?;
         Ok(held)
     }
 
     async fn finish_task(&self, claim: &TaskClaim, document: &[u8]) -> Result<bool, StoreError> {
         let mut tx = self.begin().await?;
+        // The job's row first, as whoever ends the job has it first.
+        let query = sqlx::query(sql::OTHERS_MADE_PROGRESS).bind(claim.job.to_string()).bind(claim.token.to_string());
+        if query.execute(&mut *tx).await?.rows_affected() == 0 {
+            return Ok(false);
+        }
         let query = sqlx::query_scalar(sql::FINISH_TASK).bind(claim.token.to_string()).bind(i64::MAX);
-        let Some(fingerprint) = query.fetch_optional(&mut *tx).await? else { return Ok(false) };
-        let fingerprint: String = fingerprint;
+        let fingerprint: Option<String> = query.fetch_optional(&mut *tx).await?;
+        let Some(fingerprint) = fingerprint else { return Ok(false) };
         sqlx::query(sql::CHECKPOINT)
             .bind(claim.job.to_string())
             .bind(&claim.task.image)
@@ -140,7 +149,6 @@ impl TaskStore for Rows {
             .bind(document)
             .execute(&mut *tx)
             .await?;
-        sqlx::query(sql::OTHERS_MADE_PROGRESS).bind(claim.job.to_string()).execute(&mut *tx).await?;
         tx.commit().await?;
         Ok(true)
     }

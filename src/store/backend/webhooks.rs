@@ -1,6 +1,6 @@
 //! Webhooks and the messages to them.
 
-use super::super::{Rows, Tx};
+use super::super::{Rows, Tx, queues};
 use super::read::{self, delivery, job, webhook};
 use crate::store::webhooks::{MAX_ATTEMPTS, MAX_WEBHOOKS, SigningSecret};
 use crate::store::{
@@ -82,20 +82,27 @@ impl WebhookStore for Rows {
         query.fetch_optional(&self.write).await?.as_ref().map(delivery).transpose()
     }
 
-    async fn claim_delivery(&self, lease: Duration, now: Timestamp) -> Result<Option<DeliveryClaim>, StoreError> {
+    async fn claim_delivery(
+        &self,
+        busy: &[OrganisationId],
+        lease: Duration,
+        now: Timestamp,
+    ) -> Result<Option<DeliveryClaim>, StoreError> {
         // Mostly there is none: finding that out takes no turn from those who write.
         let due = sqlx::query(sql::DELIVERY_DUE).bind(now.as_millisecond()).fetch_optional(&self.read).await?;
         if due.is_none() {
             return Ok(None);
         }
         let mut tx = self.begin().await?;
-        let query = sqlx::query(sql::CLAIM_DELIVERY).bind(now.as_millisecond()).bind(super::after(now, lease));
-        let Some(row) = query.fetch_optional(&mut *tx).await? else { return Ok(None) };
+        let busy: Vec<String> = busy.iter().map(OrganisationId::to_string).collect();
+        let query = sqlx::query(queues::CLAIM_DELIVERY).bind(now.as_millisecond()).bind(super::after(now, lease));
+        let Some(row) = query.bind(busy.join(" ")).fetch_optional(&mut *tx).await? else { return Ok(None) };
         let delivery = delivery(&row)?;
         let to = sqlx::query(sql::WEBHOOK_OF_DELIVERY).bind(delivery.webhook.to_string()).fetch_one(&mut *tx).await?;
         let of = sqlx::query(sql::JOB_OF_DELIVERY).bind(delivery.job.to_string()).fetch_one(&mut *tx).await?;
         let secret = SigningSecret::kept(to.try_get("secret")?);
-        let claim = DeliveryClaim { delivery, url: to.try_get("url")?, secret, job: job(&of)? };
+        let organisation = OrganisationId(read::uuid(&to, "organisation_id")?);
+        let claim = DeliveryClaim { organisation, delivery, url: to.try_get("url")?, secret, job: job(&of)? };
         tx.commit().await?;
         Ok(Some(claim))
     }

@@ -3,7 +3,7 @@
 use super::{ALL, LEASE, ORGANISATION, at, claim, enqueue, model, plant, survey};
 use heliomap::plant::PlantId;
 use heliomap::store::{
-    Completed, Created, DeliveryState, Ending, JobId, NewWebhook, OrganisationId, Sent, SigningSecret, Store,
+    Completed, Created, DeliveryState, Ending, JobId, NewWebhook, OrganisationId, Quotas, Sent, SigningSecret, Store,
     StoreError, Webhook, WebhookId,
 };
 use uuid::Uuid;
@@ -95,9 +95,9 @@ pub async fn messages_are_sent_by_one_at_a_time_and_not_for_ever(store: &dyn Sto
     let survey = survey(store, plant(store, "A").await.id, "June").await;
     let webhook = webhook(store, ORGANISATION, None).await;
     let job = enqueue(store, &survey).await;
-    assert!(store.claim_delivery(LEASE, at(1)).await.unwrap().is_none());
+    assert!(store.claim_delivery(&[], LEASE, at(1)).await.unwrap().is_none());
     store.cancel_job(survey.plant, job.id, at(1)).await.unwrap();
-    let take = async |now| store.claim_delivery(LEASE, at(now)).await.unwrap();
+    let take = async |now| store.claim_delivery(&[], LEASE, at(now)).await.unwrap();
     let first = take(1).await.unwrap();
     assert_eq!(
         (first.job.id, first.url.as_str(), first.secret.reveal()),
@@ -137,4 +137,21 @@ pub async fn messages_are_sent_by_one_at_a_time_and_not_for_ever(store: &dyn Sto
     assert_eq!(messages(store, &webhook).await.len(), 1);
     store.forget_old_deliveries(at(202)).await.unwrap();
     assert!(messages(store, &webhook).await.is_empty());
+}
+
+pub async fn messages_of_a_busy_organisation_keep_no_other_waiting(store: &dyn Store) {
+    let (Created::New(other) | Created::Existing(other)) = store.create_organisation("other", at(0)).await.unwrap();
+    let other = other.id;
+    let (Created::New(theirs) | Created::Existing(theirs)) =
+        store.create_plant(other, "A", Quotas::default(), at(0)).await.unwrap();
+    let ours = plant(store, "A").await;
+    for (organisation, plant, ended) in [(ORGANISATION, ours.id, 1), (other, theirs.id, 2)] {
+        webhook(store, organisation, None).await;
+        let job = enqueue(store, &survey(store, plant, "June").await).await;
+        store.cancel_job(plant, job.id, at(ended)).await.unwrap();
+    }
+    let take = async |busy: &[OrganisationId]| store.claim_delivery(busy, LEASE, at(3)).await.unwrap();
+    assert!(take(&[ORGANISATION, other]).await.is_none());
+    assert_eq!(take(&[ORGANISATION]).await.unwrap().organisation, other);
+    assert_eq!(take(&[other]).await.unwrap().organisation, ORGANISATION);
 }
