@@ -104,9 +104,16 @@ pub fn map_folder(
         .zip(&layouts)
         .map(|((shot, detections), layout)| View { shot, detections, layout })
         .collect();
-    let located = clock.stage(Stage::Locate, || fusion::locate::locate(&views, &cloud))?;
-    let fusion_options = FusionOptions { rows_per_bench: options.rows_per_bench, ..FusionOptions::default() };
-    let fused = clock.stage(Stage::Fuse, || fusion::fuse(&views, located, &fusion_options))?;
+    let fused = match observer.recall_structure() {
+        Some(fused) => fused,
+        None => {
+            let located = clock.stage(Stage::Locate, || fusion::locate::locate(&views, &cloud))?;
+            let fusion_options = FusionOptions { rows_per_bench: options.rows_per_bench, ..FusionOptions::default() };
+            let fused = clock.stage(Stage::Fuse, || fusion::fuse(&views, located, &fusion_options))?;
+            observer.structure(&fused);
+            fused
+        }
+    };
     if fused.benches.is_empty() {
         return Err(MapError::Input {
             code: "no_benches",

@@ -114,7 +114,7 @@ impl Undecided {
         let places_m = vec![pieces[*a].middle(), pieces[*b].middle()];
         match self {
             Self::Conflict { a, b, columns, rows, pairs } => Doubt {
-                code: "bench_conflict",
+                code: "bench_conflict".into(),
                 message: format!(
                     "the bench at {} is seen differently in {} and {} (and in {} more pairs of images): by what the two \
                      show, columns differ by {columns:+} and rows by {rows:+}, by all images together they do not; check \
@@ -132,7 +132,7 @@ impl Undecided {
                 let choices: Vec<String> =
                     choices.iter().map(|(col, row)| format!("column {} row {}", 1 + col, 1 + row)).collect();
                 Doubt {
-                    code: "bench_shift_unsure",
+                    code: "bench_shift_unsure".into(),
                     message: format!(
                         "the bench at {} shows no end that both {} and {} see: column 1, row 1 of what the first shows may \
                          be {} of the second (margin {margin:.1}); they are not joined, and what lies over the other is \

@@ -8,10 +8,11 @@ use crate::layout::End;
 use nalgebra::{Vector2, Vector3};
 use rstar::RTree;
 use rstar::primitives::GeomWithData;
+use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// A module seen in one view.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Observation {
     pub view: usize,
     /// Index into the view's detections.
@@ -23,7 +24,7 @@ pub struct Observation {
 }
 
 /// A module of the fused structure.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct FusedModule {
     /// Row from the north, 0 the first.
     pub row: i32,
@@ -36,7 +37,7 @@ pub struct FusedModule {
 }
 
 /// A bench of the fused structure.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct FusedBench {
     pub rows: i32,
     pub cols: i32,
@@ -357,7 +358,7 @@ pub(super) fn without_ghosts(
             let at = over.map_or(bench.middle_m, |k| benches[k].middle_m);
             let clusters = std::iter::once(bench.cluster).chain(over.map(|k| benches[k].cluster)).collect();
             let doubt = Doubt {
-                code: "bench_seen_apart",
+                code: "bench_seen_apart".into(),
                 message: format!(
                     "{} modules seen at {:.1} m east, {:.1} m north lie over the bench at {:.1} m east, {:.1} m north, but \
                      do not fit its lattice; they are left out: check these images",
@@ -434,7 +435,7 @@ fn places_to_check(views: &[View<'_>], bench: &FusedBench, contested: &[Conteste
         .collect();
     let more = if contested.len() > 6 { format!("; and {} more places", contested.len() - 6) } else { String::new() };
     let doubt = Doubt {
-        code: "modules_unsure",
+        code: "modules_unsure".into(),
         message: format!(
             "images disagree on the bench at {:.1} m east, {:.1} m north: {}{more}",
             bench.middle_m.x,
@@ -470,7 +471,7 @@ fn holes_to_check(views: &[View<'_>], bench: &FusedBench) -> Option<OpenDoubt> {
     let shown = missing.iter().take(6).cloned().collect::<Vec<_>>().join(", ");
     let more = if missing.len() > 6 { format!(" and {} more", missing.len() - 6) } else { String::new() };
     let doubt = Doubt {
-        code: "modules_not_seen",
+        code: "modules_not_seen".into(),
         message: format!(
             "the bench at {:.1} m east, {:.1} m north has {} places where no image shows a module ({shown}{more}): they \
              are missing, or under glare in every image",

@@ -2,6 +2,7 @@
 
 use super::{Doubt, FusedBench, OpenDoubt};
 use nalgebra::Vector2;
+use serde::{Deserialize, Serialize};
 
 /// How far apart the ends of two benches of one line may stand (a road lies between them), metres.
 const WIDEST_M: f64 = 15.0;
@@ -13,7 +14,7 @@ const ASIDE: f64 = 0.85;
 const DOUBTFUL_ASIDE: f64 = 1.05;
 
 /// A line: its benches from the west.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FusedLine {
     /// Indices into the benches.
     pub benches: Vec<usize>,
@@ -154,7 +155,7 @@ pub(super) fn arrange(benches: Vec<FusedBench>, doubts: &mut Vec<OpenDoubt>) -> 
 fn line_unsure(west: &FusedBench, east: &FusedBench) -> OpenDoubt {
     let (from, to) = (west.middle_m.xy(), east.middle_m.xy());
     let doubt = Doubt {
-        code: "line_unsure",
+        code: "line_unsure".into(),
         message: format!(
             "the benches at {:.1} m east, {:.1} m north and {:.1} m east, {:.1} m north face each other by the corners of \
              their ends alone: they are taken as of two lines, but may be of one",
@@ -193,7 +194,7 @@ fn bench_or_hole(west: &FusedBench, east: &FusedBench) -> Option<OpenDoubt> {
     (on_lattice && (1.0..=MOST_EMPTY).contains(&whole)).then(|| {
         let middles = [west.middle_m.xy(), east.middle_m.xy()];
         let doubt = Doubt {
-            code: "bench_or_hole",
+            code: "bench_or_hole".into(),
             message: format!(
                 "the benches at {:.1} m east, {:.1} m north and {:.1} m east, {:.1} m north stand on one lattice with \
                  {whole} empty columns between them: they are taken as two benches, but may be one whose modules are \

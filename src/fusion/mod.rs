@@ -17,6 +17,8 @@ pub use benches::{FusedBench, FusedModule, Observation};
 pub use lines::FusedLine;
 pub use locate::{Located, LocatedPiece};
 use nalgebra::Vector2;
+use serde::{Deserialize, Serialize};
+use std::borrow::Cow;
 use std::collections::HashMap;
 
 /// One image with all that is known of it.
@@ -43,10 +45,10 @@ impl Default for FusionOptions {
 }
 
 /// A doubt that a person can settle.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Doubt {
     /// A stable word.
-    pub code: &'static str,
+    pub code: Cow<'static, str>,
     /// One sentence with the choices in it.
     pub message: String,
     /// Images concerned.
@@ -80,7 +82,7 @@ fn close(doubts: Vec<OpenDoubt>, benches: &[FusedBench]) -> Vec<Doubt> {
 }
 
 /// The structure of the whole plant.
-#[derive(Debug)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Fused {
     /// Lines from the north (or, where rows run north-south, from the east).
     pub lines: Vec<FusedLine>,

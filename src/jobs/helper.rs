@@ -40,7 +40,7 @@ impl Worker {
         }
         let mapper = self.mapper.clone();
         let identity =
-            tokio::task::spawn_blocking(move || mapper.identity()).await.map_err(|_| AttemptError::Panicked)??;
+            tokio::task::spawn_blocking(move || mapper.identity()).await.map_err(|_| AttemptError::Panicked)?;
         let Some(first) = self.store.take_task(&identity, self.settings.lease, Timestamp::now()).await? else {
             return Ok(0);
         };

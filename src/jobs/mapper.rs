@@ -23,7 +23,7 @@ pub trait Mapper: Send + Sync + 'static {
     fn search(&self, next: &mut NextTask<'_>, found: &mut FoundInTask<'_>, stop: &Stopped<'_>) -> Result<(), MapError>;
 
     /// Tells this mapper from every other that may find something else in the same images.
-    fn identity(&self) -> Result<String, MapError>;
+    fn identity(&self) -> String;
 }
 
 /// Gives the next image of another worker's mapping.
@@ -110,8 +110,10 @@ impl Mapper for PipelineMapper {
         search::search(&*self.detector()?, next, found, stop).map(drop)
     }
 
-    fn identity(&self) -> Result<String, MapError> {
-        Ok(format!("{} {}", program(), self.detector()?.identity()))
+    fn identity(&self) -> String {
+        // Without a detector it maps surveys that have boxes.
+        let detector = self.opened().map_or_else(|_| "without a detector".to_owned(), |detector| detector.identity());
+        format!("{} {detector}", program())
     }
 }
 

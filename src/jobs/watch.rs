@@ -1,14 +1,22 @@
 //! What the mapping thread and the worker tell each other while a job runs.
 
 use super::share::Share;
+use crate::fusion::Fused;
 use crate::pipeline::{Found, Observer, Sought, Stage, Turn};
 use crate::store::{Checkpoint, Progress};
 use serde::{Deserialize, Serialize};
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::sync::atomic::{AtomicU8, Ordering};
 use std::sync::{Mutex, MutexGuard, OnceLock};
 use std::time::Instant;
 use tracing::Span;
+
+/// How checkpoints of the fused structure are called, before the number of the part: as no image is.
+const STRUCTURE: &str = "fused structure/";
+/// Bytes of one such part.
+const PART_BYTES: usize = 8 << 20;
+/// Bytes after which what was found waits for its turn: heartbeats go on in between.
+const BYTES_AT_ONCE: usize = 32 << 20;
 
 /// Why a running job must stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -44,6 +52,8 @@ struct Seen {
     images: u64,
     /// How many images were recalled, which takes no time.
     recalled: u64,
+    /// Whether the structure was, too.
+    structure_recalled: bool,
     /// The span of the stage that runs, which ends when it is dropped.
     span: Option<Span>,
 }
@@ -53,7 +63,9 @@ struct Seen {
 struct Findings {
     fingerprint: String,
     known: HashMap<String, Found>,
-    fresh: Vec<Checkpoint>,
+    /// The parts of a structure that an earlier attempt had fused, by name.
+    structure: BTreeMap<String, Vec<u8>>,
+    fresh: VecDeque<Checkpoint>,
     last: Option<Pace>,
 }
 
@@ -112,12 +124,14 @@ impl Watch {
 
     /// Tells what an earlier attempt had found under this fingerprint, and what the stages of the last job took.
     pub fn begin(&self, fingerprint: String, known: &[Checkpoint], last: Option<Pace>) {
-        let known = known
-            .iter()
+        let (parts, images): (Vec<_>, Vec<_>) = known.iter().partition(|kept| kept.name.starts_with(STRUCTURE));
+        let images = images.into_iter();
+        let known = images
             // One that cannot be read is found again.
             .filter_map(|kept| Some((kept.name.clone(), ciborium::from_reader(kept.document.as_slice()).ok()?)))
             .collect();
-        *locked(&self.findings) = Findings { fingerprint, known, fresh: Vec::new(), last };
+        let structure = parts.into_iter().map(|part| (part.name.clone(), part.document.clone())).collect();
+        *locked(&self.findings) = Findings { fingerprint, known, structure, fresh: VecDeque::new(), last };
     }
 
     /// Tells how images are shared from now on.
@@ -125,10 +139,17 @@ impl Watch {
         let _ = self.share.set(share);
     }
 
-    /// What was found since the last time, and under which fingerprint.
+    /// What was found since the last time, or as much of it as is stored in a moment, and under which fingerprint.
     pub fn take_found(&self) -> (String, Vec<Checkpoint>) {
         let mut findings = locked(&self.findings);
-        (findings.fingerprint.clone(), std::mem::take(&mut findings.fresh))
+        let mut bytes = 0;
+        let parts = findings.fresh.iter().take_while(|found| {
+            let begins_in_time = bytes < BYTES_AT_ONCE;
+            bytes += found.document.len();
+            begins_in_time
+        });
+        let count = parts.count();
+        (findings.fingerprint.clone(), findings.fresh.drain(..count).collect())
     }
 
     /// How far the mapping has come.
@@ -146,7 +167,8 @@ impl Watch {
     /// What the stages took; nothing where some of the images were recalled.
     pub fn pace(&self) -> Option<Pace> {
         let seen = locked(&self.seen);
-        if seen.recalled > 0 || seen.images == 0 {
+        // No image alone makes a plant: where one is told of, boxes were read instead of a search.
+        if seen.recalled > 0 || seen.structure_recalled || seen.images < 2 {
             return None;
         }
         let ends = seen.begun.iter().skip(1).map(|(_, begun)| *begun).chain([Instant::now()]);
@@ -220,7 +242,26 @@ impl Observer for Watch {
         let mut document = Vec::new();
         if ciborium::into_writer(found, &mut document).is_ok() {
             let name = found.detections.image.clone();
-            locked(&self.findings).fresh.push(Checkpoint { name, document });
+            locked(&self.findings).fresh.push_back(Checkpoint { name, document });
+        }
+    }
+
+    fn recall_structure(&self) -> Option<Fused> {
+        let parts = std::mem::take(&mut locked(&self.findings).structure);
+        let document = parts.into_values().collect::<Vec<_>>().concat();
+        // One of which parts are missing is fused again.
+        let fused = ciborium::from_reader(document.as_slice()).ok()?;
+        locked(&self.seen).structure_recalled = true;
+        Some(fused)
+    }
+
+    fn structure(&self, fused: &Fused) {
+        let mut document = Vec::new();
+        if ciborium::into_writer(fused, &mut document).is_ok() {
+            let parts = document.chunks(PART_BYTES).enumerate();
+            let parts = parts
+                .map(|(part, bytes)| Checkpoint { name: format!("{STRUCTURE}{part:09}"), document: bytes.to_vec() });
+            locked(&self.findings).fresh.extend(parts);
         }
     }
 }
@@ -280,6 +321,37 @@ mod tests {
     }
 
     #[test]
+    fn a_structure_is_recalled_whole_or_not_at_all() {
+        let bench = |rows| crate::fusion::Doubt {
+            code: "bench_conflict".into(),
+            message: "x".repeat(PART_BYTES / 2),
+            images: vec![format!("{rows}.jpg")],
+            benches: vec![rows],
+            places_m: vec![Vector2::new(0.1 + 0.2, 1.0 / 3.0)],
+        };
+        let fused = Fused { lines: Vec::new(), benches: Vec::new(), doubts: (0..12).map(bench).collect() };
+        let watch = Watch::default();
+        watch.structure(&fused);
+        let mut kept = Vec::new();
+        for most in [4, 3, 0] {
+            let (_, parts) = watch.take_found();
+            assert_eq!(parts.len(), most);
+            kept.extend(parts);
+        }
+        let again = Watch::default();
+        again.begin("f".to_owned(), &kept, None);
+        assert_eq!(again.recall_structure().unwrap().doubts, fused.doubts);
+        assert!(again.recall_structure().is_none() && again.pace().is_none());
+        for missing in 0..kept.len() {
+            let mut parts = kept.clone();
+            parts.remove(missing);
+            let again = Watch::default();
+            again.begin("f".to_owned(), &parts, None);
+            assert!(again.recall_structure().is_none(), "without part {missing}");
+        }
+    }
+
+    #[test]
     fn remaining_time_is_told_once_it_is_known() {
         let begun = Instant::now();
         let mut seen = Seen {
@@ -287,6 +359,7 @@ mod tests {
             begun: vec![(Stage::Read, begun), (Stage::Detect, begun)],
             images: 10,
             recalled: 2,
+            structure_recalled: false,
             span: None,
         };
         let later = begun + Duration::from_secs(6);

@@ -224,11 +224,11 @@ impl Worker {
         let files = self.store.files(job.survey).await?;
         let mapper = self.mapper.clone();
         let identity =
-            tokio::task::spawn_blocking(move || mapper.identity()).await.map_err(|_| AttemptError::Panicked)??;
+            tokio::task::spawn_blocking(move || mapper.identity()).await.map_err(|_| AttemptError::Panicked)?;
         let fingerprint = fingerprint(&files, &job.options, &identity);
         let known = self.store.checkpoints(job.id, &fingerprint).await?;
         if !known.is_empty() {
-            tracing::info!(images = known.len(), "the job goes on where it was");
+            tracing::info!(findings = known.len(), "the job goes on where it was");
         }
         let pace = self.store.last_stage_ms().await?;
         watch.begin(fingerprint.clone(), &known, pace.and_then(|text| serde_json::from_str(&text).ok()));

@@ -296,9 +296,14 @@ pub(super) fn from_boxes(
                 if observer.cancelled() {
                     return Err(MapError::Cancelled);
                 }
+                if let Some(found) = observer.recall(&detections.image) {
+                    return Ok(Seen::new(shot, found));
+                }
                 let grey = image::imageops::grayscale(&folder.load(&project.photos[shot])?);
                 let layout = layout::infer(&detections, Some(&grey), &LayoutOptions::default());
-                Ok(Seen { shot, detections, layout })
+                let found = Found { detections, layout };
+                observer.found(&found);
+                Ok(Seen::new(shot, found))
             })
             .collect()
     })?

@@ -138,7 +138,7 @@ fn warning(doubt: &Doubt, named: &[Option<(BenchId, String)>]) -> Warning {
     benches.sort_unstable();
     let message =
         if labels.is_empty() { doubt.message.clone() } else { format!("{}: {}", labels.join(", "), doubt.message) };
-    Warning { benches, ..Warning::new(doubt.code, message, doubt.images.iter().cloned()) }
+    Warning { benches, ..Warning::new(&doubt.code, message, doubt.images.iter().cloned()) }
 }
 
 /// A module on its way into the model.

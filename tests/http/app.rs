@@ -125,8 +125,8 @@ impl Mapper for ScriptedMapper {
         Ok(())
     }
 
-    fn identity(&self) -> Result<String, MapError> {
-        Ok("scripted".to_owned())
+    fn identity(&self) -> String {
+        "scripted".to_owned()
     }
 }
 

@@ -87,7 +87,7 @@ async fn modules(app: &App, survey: &str) -> Vec<Value> {
 
 /// Takes an image of a running job, as a worker with this mapper would.
 async fn take(app: &App, mapper: &PipelineMapper, lease: Duration) -> TaskClaim {
-    let identity = mapper.identity().unwrap();
+    let identity = mapper.identity();
     loop {
         if let Some(claim) = app.store.take_task(&identity, lease, Timestamp::now()).await.unwrap() {
             return claim;

@@ -92,7 +92,7 @@ impl Survey {
         self.write("reconstruction.json", serde_json::to_vec(&reconstruction).unwrap());
     }
 
-    fn boxes(&self) -> PathBuf {
+    pub fn boxes(&self) -> PathBuf {
         self.folder.path().join("boxes.json")
     }
 
