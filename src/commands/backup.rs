@@ -5,6 +5,7 @@ use super::{ROWS, open_blobs, open_storage_there, run_async};
 use anyhow::{Context, bail, ensure};
 use futures::{Stream, TryStreamExt, stream};
 use heliomap::config::{BackupArgs, RestoreArgs, StorageArgs, VerifyArgs};
+use heliomap::store::schema::Schema;
 use heliomap::store::{BlobRecord, Blobs, Digest, SqliteStore, StagedFile, Store, UploadStore};
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -39,9 +40,14 @@ pub fn backup(args: BackupArgs) -> anyhow::Result<()> {
         let folder = new_folder(&args.folder)?;
         let rows = args.storage.data_dir.join(ROWS);
         ensure!(rows.is_file(), "there is no {}: name the service's data folder with --data-dir", rows.display());
-        let (live, blobs) = (SqliteStore::open(&rows).await?, open_blobs(&args.storage).await?);
+        let (live, blobs) = (SqliteStore::open_as_it_is(&rows).await?, open_blobs(&args.storage).await?);
         let target = folder.join(ROWS);
         live.snapshot(&target).await.context("copying the database")?;
+        // An older version's copy is brought up to date, and not what that version is at work with.
+        if SqliteStore::examine(&target).await?.schema == Schema::Ahead {
+            std::fs::remove_file(&target)?;
+            bail!("the database is of a newer version of heliomap: make the backup by that version's program");
+        }
         // Bytes of uploads that are not whole stay behind: clients begin these anew.
         let snapshot = SqliteStore::open(&target).await?;
         snapshot.delete_expired_uploads(Timestamp::MAX).await?;
@@ -58,7 +64,7 @@ pub fn backup(args: BackupArgs) -> anyhow::Result<()> {
                     bytes += blob.size;
                 }
                 // Its plant was deleted meanwhile: that holds here, too.
-                Err(_) if live.plant(blob.plant).await?.is_none() => {
+                Err(_) if live.plant(blob.plant).await.is_ok_and(|plant| plant.is_none()) => {
                     snapshot.delete_plant(blob.plant, Timestamp::now()).await?;
                 }
                 Err(error) => {
@@ -67,6 +73,7 @@ pub fn backup(args: BackupArgs) -> anyhow::Result<()> {
             }
         }
         snapshot.close().await;
+        live.close().await;
         let _ = std::fs::remove_file(target.with_extension("lock"));
         sync(&target)?;
         let manifest =
@@ -95,7 +102,13 @@ pub fn restore(args: RestoreArgs) -> anyhow::Result<()> {
         ensure!(!rows.exists(), "{} has a database already: name a new folder with --data-dir", data.display());
         std::fs::create_dir_all(data).with_context(|| format!("creating {}", data.display()))?;
         let blobs = open_blobs(&args.storage).await?;
+        // A journal of a database that is not here any more would be taken for the new one's.
         let coming = data.join("heliomap.restoring");
+        for name in [&rows, &coming] {
+            remove_journals(name)?;
+        }
+        remove(&coming)?;
+        sync(data)?;
         std::fs::copy(args.folder.join(ROWS), &coming).with_context(|| format!("copying {ROWS}"))?;
         let store = SqliteStore::open(&coming).await.context("the backup's database cannot be read")?;
         let taken = take_blobs(&store, &blobs, &args.folder).await;
@@ -114,6 +127,26 @@ pub fn restore(args: RestoreArgs) -> anyhow::Result<()> {
         sync(data)?;
         print(format_args!("{count} blobs and their rows are back, as of {}\n", manifest.created))
     })
+}
+
+/// Removes the logs that SQLite keeps beside a database file.
+fn remove_journals(database: &Path) -> anyhow::Result<()> {
+    for ending in ["-wal", "-shm", "-journal"] {
+        let mut name = database.as_os_str().to_owned();
+        name.push(ending);
+        remove(Path::new(&name))?;
+    }
+    Ok(())
+}
+
+/// Removes a file that may not be there.
+fn remove(file: &Path) -> anyhow::Result<()> {
+    match std::fs::remove_file(file) {
+        Err(error) if error.kind() != ErrorKind::NotFound => {
+            Err(error).with_context(|| format!("removing {}", file.display()))
+        }
+        _ => Ok(()),
+    }
 }
 
 /// Stores all blobs that the rows name, from a backup; how many.

@@ -1,7 +1,7 @@
 //! `heliomap keys`: keys made by whoever runs the service, the first one of each organisation among them.
 
 use super::output::{print, print_once, tell};
-use super::{open_storage, open_storage_there, run_async};
+use super::{open_storage_beside, open_storage_there, run_async};
 use anyhow::{Context, bail};
 use heliomap::config::{KeysArgs, KeysCommand};
 use heliomap::plant::PlantId;
@@ -12,7 +12,7 @@ use jiff::{SignedDuration, Timestamp};
 pub fn run(args: KeysArgs) -> anyhow::Result<()> {
     run_async(async {
         let (store, _) = match args.command {
-            KeysCommand::Create { .. } => open_storage(&args.storage).await?,
+            KeysCommand::Create { .. } => open_storage_beside(&args.storage).await?,
             _ => open_storage_there(&args.storage).await?,
         };
         let now = Timestamp::now();

@@ -97,7 +97,31 @@ async fn forget_what_is_over(store: &dyn Store, blobs: &Blobs) -> Result<(), Sto
     store.forget_deleted_plants(Timestamp::now() - STALE_UPLOADS).await
 }
 
-/// As [`open_storage`], for commands that make nothing new: where no service has been, that is told.
+/// As [`open_storage`], for commands beside a service: a database that the service has not brought up to date is left as
+/// it is.
+async fn open_storage_beside(args: &StorageArgs) -> anyhow::Result<(Arc<dyn Store>, Blobs)> {
+    let rows = args.data_dir.join(ROWS);
+    let schema = match &args.database {
+        Some(url) => PostgresStore::examine(url).await.context("cannot use the database of --database")?.schema,
+        None if rows.is_file() => SqliteStore::examine(&rows).await.with_context(|| unusable(&args.data_dir))?.schema,
+        None => Schema::Absent,
+    };
+    only_of_this_version(schema)?;
+    open_storage(args).await
+}
+
+/// Refuses a database to which an older or a newer version of the program belongs.
+fn only_of_this_version(schema: Schema) -> anyhow::Result<()> {
+    ensure!(
+        !matches!(schema, Schema::Behind { .. }),
+        "the database is of an older version of heliomap: use that version's program, or start this version's `heliomap \
+         serve` first, which brings it up to date"
+    );
+    ensure!(schema != Schema::Ahead, "the database is of a newer version of heliomap: use that version's program");
+    Ok(())
+}
+
+/// As [`open_storage_beside`], for commands that make nothing new: where no service has been, that is told.
 async fn open_storage_there(args: &StorageArgs) -> anyhow::Result<(Arc<dyn Store>, Blobs)> {
     let folder = &args.data_dir;
     match &args.database {
@@ -118,7 +142,7 @@ async fn open_storage_there(args: &StorageArgs) -> anyhow::Result<(Arc<dyn Store
             ensure!(rows.is_file(), "there is no {}: name the service's data folder with --data-dir", rows.display());
         }
     }
-    open_storage(args).await
+    open_storage_beside(args).await
 }
 
 /// The pipeline, its detector opened. Where that fails, whoever named models or a runtime must hear of it; a service without

@@ -1,7 +1,7 @@
 //! `heliomap organisations`: who there is, what each keeps and may keep.
 
 use super::output::print;
-use super::{open_storage, open_storage_there, run_async};
+use super::{open_storage_beside, open_storage_there, run_async};
 use anyhow::Context;
 use heliomap::config::{OrganisationsArgs, OrganisationsCommand};
 use heliomap::store::usage::{Quotas, UNLIMITED, Usage};
@@ -12,7 +12,7 @@ use jiff::Timestamp;
 pub fn run(args: OrganisationsArgs) -> anyhow::Result<()> {
     run_async(async {
         let (store, _) = match args.command {
-            OrganisationsCommand::Create { .. } => open_storage(&args.storage).await?,
+            OrganisationsCommand::Create { .. } => open_storage_beside(&args.storage).await?,
             OrganisationsCommand::List | OrganisationsCommand::Quota { .. } => {
                 open_storage_there(&args.storage).await?
             }

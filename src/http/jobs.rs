@@ -198,7 +198,9 @@ impl From<Job> for JobView {
             attempt: job.attempt,
             max_attempts: job.max_attempts,
             priority: job.priority,
-            options: serde_json::from_str(&job.options).unwrap_or_default(),
+            // In full, unless a newer version wrote them.
+            options: serde_json::from_str::<MapOptions>(&job.options)
+                .map_or_else(|_| serde_json::from_str(&job.options).unwrap_or_default(), |all| serde_json::json!(all)),
             model: job.model_version.map(|version| format!("/api/v1/plants/{}/models/{version}", job.plant)),
             model_version: job.model_version,
             created: job.created,
@@ -275,7 +277,7 @@ pub async fn start(
         let what: Vec<&str> = missing.iter().map(|missing| missing.message.as_str()).collect();
         return Err(ApiError::new(Code::SurveyIncomplete, what.join("; ")).with("missing", missing));
     }
-    let options = serde_json::json!(options).to_string();
+    let options = options.said();
     let request = JobRequest { plant, survey, options, priority, max_attempts: state.limits.max_attempts };
     let (status, job) = match state.store.enqueue_job(&request, Timestamp::now()).await? {
         Enqueued::New(job) => {

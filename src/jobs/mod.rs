@@ -28,6 +28,8 @@ pub(crate) enum AttemptError {
     Store(#[from] StoreError),
     #[error("prepare the folder of the job: {0}")]
     Folder(#[from] std::io::Error),
+    #[error("the job's options cannot be read: {0}")]
+    Options(serde_json::Error),
     #[error("the plant's model {version} cannot be read: {source}")]
     PreviousModel { version: u32, source: serde_json::Error },
     #[error("the mapper panicked")]

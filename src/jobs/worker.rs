@@ -27,7 +27,7 @@ pub struct WorkerSettings {
     pub heartbeat: Duration,
     /// How often an idle worker looks for work.
     pub poll: Duration,
-    /// How long after a first failure of the environment a job is tried again; four times as long after the next.
+    /// How long after a first failure of the environment a job is tried again, as [`Ending::Retry`] has it.
     pub backoff: Duration,
 }
 
@@ -204,10 +204,7 @@ impl Worker {
     /// Maps the survey and stores the model's bytes; the rows are left to [`Self::settle`].
     async fn attempt(&self, claim: &Claim, watch: &Arc<Watch>) -> Result<NewModel, AttemptError> {
         let job = &claim.job;
-        let options: MapOptions = serde_json::from_str(&job.options).map_err(|error| MapError::Input {
-            code: "invalid_options",
-            message: format!("the job's options cannot be read: {error}; start a new job"),
-        })?;
+        let options: MapOptions = serde_json::from_str(&job.options).map_err(AttemptError::Options)?;
         let gone = |what| StoreError::Gone { what };
         let plant = self.store.plant(job.plant).await?.ok_or(gone("plant"))?;
         let previous = match self.store.model(job.plant, None).await? {
@@ -304,18 +301,19 @@ impl Worker {
                     Some(Completed::Outdated) => Ending::Retry {
                         code: "outdated".to_owned(),
                         message: "the plant got another model meanwhile; the survey is mapped again".to_owned(),
-                        at: now,
+                        backoff: Duration::ZERO,
                     },
                 }
             }
             (Err(_), Some(Stop::Cancelled)) => Ending::Cancelled,
             (Err(_), Some(Stop::Shutdown)) => Ending::Released,
-            (Err(error), _) => self.ending(claim, error, now),
+            (Err(error), _) => self.ending(error),
         };
         tracing::info!(?ending, "job ends without a model");
         self.count(match &ending {
             Ending::Failed { .. } => "failed",
             Ending::Retry { .. } => "tried_again",
+            Ending::Declined { .. } => "declined",
             Ending::Cancelled => "cancelled",
             Ending::Released => "released",
         });
@@ -330,11 +328,11 @@ impl Worker {
     }
 
     /// What is said of an error, and whether the job is tried again.
-    fn ending(&self, claim: &Claim, error: AttemptError, now: Timestamp) -> Ending {
+    fn ending(&self, error: AttemptError) -> Ending {
         let retry = |code: &str, message: String| Ending::Retry {
             code: code.to_owned(),
             message,
-            at: now + self.settings.backoff * 4_u32.saturating_pow(claim.job.attempt.saturating_sub(1).min(8)),
+            backoff: self.settings.backoff,
         };
         let internal = || Ending::Failed {
             code: "internal_error".to_owned(),
@@ -350,7 +348,15 @@ impl Worker {
                 tracing::error!(%error, "the environment failed");
                 retry("environment", "the service's storage failed; its log says more".to_owned())
             }
-            AttemptError::Map(MapError::Cancelled) | AttemptError::PreviousModel { .. } | AttemptError::Panicked => {
+            AttemptError::Options(_) | AttemptError::PreviousModel { .. } => {
+                tracing::warn!(%error, "a worker of another version has to do it");
+                Ending::Declined {
+                    code: "another_version".to_owned(),
+                    message: format!("{error}: the job waits for a worker of the version that wrote that"),
+                    pause: self.settings.backoff,
+                }
+            }
+            AttemptError::Map(MapError::Cancelled) | AttemptError::Panicked => {
                 tracing::error!(%error, "the mapping failed");
                 internal()
             }

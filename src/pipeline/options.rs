@@ -52,6 +52,16 @@ impl Default for MapOptions {
 }
 
 impl MapOptions {
+    /// Those options alone that are not as by default, JSON: what a program does not know does not keep it from reading
+    /// them where it was not asked for.
+    pub fn said(&self) -> String {
+        let (mut said, silent) = (serde_json::json!(self), serde_json::json!(Self::default()));
+        if let Some(options) = said.as_object_mut() {
+            options.retain(|name, value| silent.get(name) != Some(value));
+        }
+        said.to_string()
+    }
+
     /// Refuses values that make no sense.
     ///
     /// # Errors

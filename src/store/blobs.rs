@@ -173,7 +173,8 @@ impl Blobs {
         .await
     }
 
-    /// Stores a staged file in a plant; it appears as a whole or not at all. Storing the same bytes again is harmless.
+    /// Stores a staged file in a plant; it appears as a whole or not at all. Bytes that are there already are replaced:
+    /// should they have been damaged meanwhile, they are as they were stored again.
     pub async fn put_file(&self, plant: PlantId, file: StagedFile) -> Result<(), StoreError> {
         let key = key(plant, file.sha256);
         match &self.local {
@@ -185,13 +186,8 @@ impl Blobs {
         }
     }
 
-    /// Sends a staged file to the bucket, in parts where it is large, unless it is there.
+    /// Sends a staged file to the bucket, in parts where it is large.
     async fn send(&self, key: Key, file: StagedFile) -> Result<(), StoreError> {
-        match self.store.head(&key).await {
-            Ok(there) if there.size == file.size => return Ok(()),
-            Ok(_) | Err(object_store::Error::NotFound { .. }) => {}
-            Err(error) => return Err(error.into()),
-        }
         // The semaphore is never closed.
         let _turn = self.senders.acquire().await;
         let source = tokio::fs::File::open(&file.path).await.map_err(io("open", &file.path))?;
@@ -342,9 +338,6 @@ fn key(plant: PlantId, sha256: Digest) -> Key {
 
 /// Renames a synced file to its place and makes the new name durable.
 fn move_into_place(staged: TempPath, target: &Path) -> std::io::Result<()> {
-    if target.exists() {
-        return Ok(());
-    }
     let folder = target.parent().ok_or(std::io::ErrorKind::InvalidInput)?;
     std::fs::create_dir_all(folder)?;
     // Readers get hard links to it: nobody may write to it.

@@ -290,13 +290,19 @@ pub enum Heartbeat {
     Lost,
 }
 
+/// The longest time between two attempts at a job.
+pub const LONGEST_BACKOFF: Duration = Duration::from_secs(600);
+
 /// How a claimed job ends without a model.
 #[derive(Debug, Clone)]
 pub enum Ending {
     /// For good.
     Failed { code: String, message: String },
-    /// To be tried again from `at`, unless that was the last attempt of those that got nowhere.
-    Retry { code: String, message: String, at: Timestamp },
+    /// To be tried again, unless that was the last attempt of those that got nowhere: `backoff` after the first of these,
+    /// four times as long after each further one, at most [`LONGEST_BACKOFF`].
+    Retry { code: String, message: String, backoff: Duration },
+    /// To be tried after `pause` as if it had not been claimed, by a worker that can.
+    Declined { code: String, message: String, pause: Duration },
     /// Because someone asked for it.
     Cancelled,
     /// Back to the queue as if it had not been claimed, because the worker stops.

@@ -54,12 +54,19 @@ impl SqliteStore {
         Ok(Self { read, write })
     }
 
-    /// Looks at a file without changing its schema.
-    pub async fn examine(file: &Path) -> Result<Examined, StoreError> {
+    /// Opens a file and leaves its schema as it is: another version of the program may be at work with it.
+    pub async fn open_as_it_is(file: &Path) -> Result<Self, StoreError> {
         let options = SqliteConnectOptions::new().filename(file).busy_timeout(BUSY_TIMEOUT).foreign_keys(true);
         let write = SqlitePoolOptions::new().max_connections(1).connect_with(options).await?;
-        let rows = Self { read: write.clone(), write };
-        backend::examine::examine(&rows, &sqlx::migrate!("migrations/sqlite")).await
+        Ok(Self { read: write.clone(), write })
+    }
+
+    /// Looks at a file without changing its schema.
+    pub async fn examine(file: &Path) -> Result<Examined, StoreError> {
+        let rows = Self::open_as_it_is(file).await?;
+        let examined = backend::examine::examine(&rows, &sqlx::migrate!("migrations/sqlite")).await;
+        rows.close().await;
+        examined
     }
 
     /// Writes all rows as they are at one moment to a new file, while others read and write.

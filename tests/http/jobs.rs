@@ -1,5 +1,7 @@
 use crate::app::{Act, App, assert_problem, job_path, jpeg, plant_path};
-use heliomap::store::Digest;
+use heliomap::plant::PlantId;
+use heliomap::store::{Digest, Enqueued, JobId, JobRequest, SurveyId};
+use jiff::Timestamp;
 use reqwest::StatusCode;
 use serde_json::json;
 use std::time::Duration;
@@ -234,5 +236,32 @@ async fn progress_comes_as_events() {
         404,
         "job_not_found",
         "",
+    );
+}
+
+#[tokio::test]
+async fn options_of_a_newer_version_wait_for_a_worker_that_knows_them() {
+    let app = App::new(&[Act::Map(1)]).await;
+    let survey = app.complete_survey().await;
+    let (_, job) = app.post(&format!("{survey}/jobs"), json!({"rows_per_bench": 2, "seed": 1})).await;
+    let job = app.follow(&job).await;
+    let (plant, id) = (job["plant"].as_str().unwrap(), job["id"].as_str().unwrap());
+    let (plant, survey) = (PlantId(plant.parse().unwrap()), SurveyId(job["survey"].as_str().unwrap().parse().unwrap()));
+    // What is as by default is not written down, and told all the same.
+    let kept = app.store.job(plant, JobId(id.parse().unwrap())).await.unwrap().unwrap();
+    assert_eq!(kept.options, r#"{"rows_per_bench":2}"#);
+    assert_eq!((&job["options"]["rows_per_bench"], &job["options"]["seed"]), (&json!(2), &json!(1)));
+
+    let options = r#"{"of_tomorrow":7}"#.to_owned();
+    let request = JobRequest { plant, survey, options, priority: 0, max_attempts: 1 };
+    let Enqueued::New(job) = app.store.enqueue_job(&request, Timestamp::now()).await.unwrap() else {
+        panic!("the other job has ended")
+    };
+    let job = json!({"plant": plant, "id": job.id});
+    let declined = |job: &serde_json::Value| job["state"] == "queued" && job["error"]["code"] == "another_version";
+    let job = app.follow_until(&job, declined).await;
+    assert_eq!(
+        (&job["state"], &job["attempt"], &job["options"]),
+        (&json!("queued"), &json!(0), &json!({"of_tomorrow": 7}))
     );
 }

@@ -204,6 +204,76 @@ fn a_backup_that_is_not_whole_is_not_restored() {
     assert!(!ok && said.contains("it is missing") && said.contains("1 of 3 blobs"), "{said}");
 }
 
+/// What a killed service leaves beside its database is none of the one that takes its place, nor does what became of the
+/// blobs matter.
+#[test]
+fn a_backup_is_restored_where_a_killed_service_was() {
+    let place = tempfile::tempdir().unwrap();
+    let [data, backup] = ["data", "backup"].map(|name| place.path().join(name));
+    let client = client();
+    let (program, base) = serve(&data, &["--no-worker"]);
+    let (survey, _) = super::broken_survey_with_job(&client, &base);
+    let plant = survey.split_once("/surveys/").unwrap().0;
+    let before = told(&client, &base, plant);
+    let (ok, said) = run(&["backup", text(&backup), "--data-dir", text(&data)]);
+    assert!(ok, "{said}");
+    for number in 0..300 {
+        post(&client, &format!("{base}/api/v1/plants"), &json!({"name": format!("Later {number}")}));
+    }
+    drop(program);
+    assert!(std::fs::metadata(data.join("heliomap.db-wal")).unwrap().len() > 0);
+    std::fs::remove_file(data.join("heliomap.db")).unwrap();
+    std::fs::write(data.join("heliomap.restoring-wal"), b"of a restore that was killed").unwrap();
+    let [damaged, short, lost] = blobs(&data).try_into().unwrap();
+    let bytes = std::fs::read(&damaged).unwrap();
+    for (file, bytes) in [(&damaged, [&bytes[1..], b"x"].concat()), (&short, Vec::new())] {
+        std::fs::remove_file(file).unwrap();
+        std::fs::write(file, bytes).unwrap();
+    }
+    std::fs::remove_file(lost).unwrap();
+
+    let (ok, said) = run(&["restore", text(&backup), "--data-dir", text(&data)]);
+    assert!(ok, "{said}");
+    let (ok, said) = run(&["verify", "--content", "--data-dir", text(&data)]);
+    assert!(ok && said.contains("all 3 blobs"), "{said}");
+    let (_program, base) = serve(&data, &["--no-worker"]);
+    assert_eq!(told(&client, &base, plant), before);
+    let plants = get(&client, &format!("{base}/api/v1/plants"));
+    assert_eq!(plants["items"].as_array().unwrap().len(), 1, "what came after the backup is gone");
+}
+
+/// A command of another version changes nothing of a service's database.
+#[tokio::test]
+async fn a_database_of_an_older_version_is_left_as_it_is() {
+    let place = tempfile::tempdir().unwrap();
+    let [data, backup] = ["data", "backup"].map(|name| place.path().join(name));
+    std::fs::create_dir(&data).unwrap();
+    let rows = data.join("heliomap.db");
+    let options = sqlx::sqlite::SqliteConnectOptions::new().filename(&rows).create_if_missing(true);
+    let pool = sqlx::SqlitePool::connect_with(options).await.unwrap();
+    let mut migrator = sqlx::migrate!("migrations/sqlite");
+    let all = migrator.migrations.len();
+    migrator.migrations.to_mut().truncate(all - 1);
+    migrator.run(&pool).await.unwrap();
+    let in_folder = |arguments: &[&str]| run(&[arguments, &["--data-dir", text(&data)]].concat());
+    for command in [&["verify"][..], &["keys", "list"], &["keys", "create", "--name", "k", "--scope", "admin"]] {
+        let (ok, said) = in_folder(command);
+        assert!(!ok && said.contains("of an older version"), "{command:?}: {said}");
+    }
+    let (ok, said) = in_folder(&["backup", text(&backup)]);
+    assert!(ok, "{said}");
+    let made = "SELECT COUNT(*) FROM _sqlx_migrations";
+    assert_eq!(sqlx::query_scalar::<_, i64>(made).fetch_one(&pool).await.unwrap(), all as i64 - 1);
+
+    let later = "INSERT INTO _sqlx_migrations (version, description, success, checksum, execution_time) \
+                 VALUES (99999999999999, 'later', TRUE, X'00', 0)";
+    sqlx::query(later).execute(&pool).await.unwrap();
+    for command in [&["backup", text(&place.path().join("second"))][..], &["verify"]] {
+        let (ok, said) = in_folder(command);
+        assert!(!ok && said.contains("of a newer version"), "{command:?}: {said}");
+    }
+}
+
 /// Rows by Postgres' own tools, blobs by the bucket's: as docs/OPERATION.md says.
 #[test]
 fn postgres_and_a_bucket_are_restored_by_their_own_tools() {

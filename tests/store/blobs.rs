@@ -161,15 +161,24 @@ async fn uploads_on_their_way_stay_on_this_machine(blobs: &Blobs, data: &Path) {
 }
 
 #[tokio::test]
-async fn a_damaged_blob_is_not_handed_out() {
+async fn a_damaged_blob_is_not_handed_out_and_is_whole_once_its_bytes_come_again() {
     let data = tempfile::tempdir().unwrap();
     let blobs = Blobs::in_folder(data.path()).unwrap();
     let digest = blobs.put_bytes(plant(1), b"a model".to_vec()).await.unwrap();
     let text = digest.to_string();
     let file = data.path().join(format!("blobs/plants/{}/{}/{text}", plant(1), &text[..2]));
-    std::fs::remove_file(&file).unwrap();
-    std::fs::write(&file, b"another").unwrap();
-    let error = blobs.get(plant(1), digest).await.unwrap_err();
-    assert!(matches!(&error, StoreError::Damaged { sha256, .. } if *sha256 == digest), "{error}");
-    assert!(error.to_string().contains("backup"), "{error}");
+    // A job holds on to what it has.
+    let held = data.path().join("held");
+    blobs.place(plant(1), digest, &held).await.unwrap();
+    for damaged in ["another", "a mod"] {
+        std::fs::remove_file(&file).unwrap();
+        std::fs::write(&file, damaged).unwrap();
+        let error = blobs.get(plant(1), digest).await.unwrap_err();
+        assert!(matches!(&error, StoreError::Damaged { sha256, .. } if *sha256 == digest), "{error}");
+        assert!(error.to_string().contains("backup"), "{error}");
+        blobs.put_bytes(plant(1), b"a model".to_vec()).await.unwrap();
+        assert_eq!(blobs.get(plant(1), digest).await.unwrap(), "a model");
+    }
+    assert_eq!(std::fs::read(&held).unwrap(), b"a model");
+    assert!(std::fs::metadata(&file).unwrap().permissions().readonly());
 }

@@ -61,6 +61,8 @@ on_both!(
     a_job_that_kills_its_workers_ends,
     a_released_job_has_its_attempt_back,
     retry_waits_and_ends,
+    the_pause_before_a_retry_grows_while_the_job_gets_nowhere,
+    a_job_that_a_worker_cannot_do_waits_for_another,
     checkpoints_live_as_long_as_their_job,
     jobs_by_priority,
     the_last_jobs_pace_is_known,

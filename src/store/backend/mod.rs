@@ -10,6 +10,7 @@ mod uploads;
 mod usage;
 mod webhooks;
 
+use super::super::records::LONGEST_BACKOFF;
 use super::super::sql;
 use super::super::{
     BlobRecord, Cancelled, Checkpoint, Claim, Completed, Created, Digest, Ending, Enqueued, Feature, FeatureQuery,
@@ -487,8 +488,12 @@ impl Store for Rows {
         let (state, code, message, run_after_ms, finished_ms, attempts_back) = match ending {
             Ending::Failed { code, message } => ("failed", Some(code), Some(message), None, now_ms, 0),
             Ending::Retry { code, message, .. } if exhausted => ("failed", Some(code), Some(message), None, now_ms, 0),
-            Ending::Retry { code, message, at } => {
-                ("queued", Some(code), Some(message), Some(at.as_millisecond()), None, 0)
+            Ending::Retry { code, message, backoff } => {
+                let pause = backoff.saturating_mul(4_u32.saturating_pow(used.clamp(1, 16) as u32 - 1));
+                ("queued", Some(code), Some(message), Some(after(now, pause.min(LONGEST_BACKOFF))), None, 0)
+            }
+            Ending::Declined { code, message, pause } => {
+                ("queued", Some(code), Some(message), Some(after(now, *pause)), None, 1)
             }
             Ending::Cancelled => ("cancelled", None, None, None, now_ms, 0),
             Ending::Released => ("queued", None, None, now_ms, None, 1),

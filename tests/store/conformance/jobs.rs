@@ -5,6 +5,7 @@ use heliomap::plant::PlantId;
 use heliomap::store::{
     Cancelled, Checkpoint, Completed, Ending, Enqueued, Heartbeat, JobRequest, JobState, Page, Progress, Store,
 };
+use std::time::Duration;
 use uuid::Uuid;
 
 pub async fn one_unfinished_job_per_survey(store: &dyn Store) {
@@ -88,15 +89,51 @@ pub async fn a_released_job_has_its_attempt_back(store: &dyn Store) {
 pub async fn retry_waits_and_ends(store: &dyn Store) {
     let survey = survey(store, plant(store, "A").await.id, "June").await;
     let job = enqueue(store, &survey).await;
-    let retry = |seconds| Ending::Retry { code: "environment".to_owned(), message: "m".to_owned(), at: at(seconds) };
+    let backoff = Duration::from_secs(9);
+    let retry = Ending::Retry { code: "environment".to_owned(), message: "m".to_owned(), backoff };
     let first = claim(store, 0).await.unwrap();
-    assert!(store.end_job(&first, &retry(10), at(1)).await.unwrap());
+    assert!(store.end_job(&first, &retry, at(1)).await.unwrap());
     assert_eq!(state(store, &job).await, JobState::Queued);
     assert!(claim(store, 9).await.is_none());
     let second = claim(store, 10).await.unwrap();
-    assert!(store.end_job(&second, &retry(20), at(11)).await.unwrap());
+    assert!(store.end_job(&second, &retry, at(11)).await.unwrap());
     assert_eq!(state(store, &job).await, JobState::Failed);
     assert!(claim(store, 30).await.is_none());
+}
+
+pub async fn the_pause_before_a_retry_grows_while_the_job_gets_nowhere(store: &dyn Store) {
+    let survey = survey(store, plant(store, "A").await.id, "June").await;
+    let options = "{}".to_owned();
+    let request = JobRequest { plant: survey.plant, survey: survey.id, options, priority: 0, max_attempts: 9 };
+    store.enqueue_job(&request, at(0)).await.unwrap();
+    let backoff = Duration::from_secs(5);
+    let retry = Ending::Retry { code: "environment".to_owned(), message: "m".to_owned(), backoff };
+    let mut now = 0;
+    let pauses = [5, 20, 80, 320, 600, 600];
+    for (attempt, pause) in pauses.into_iter().chain([5, 20]).enumerate() {
+        let claimed = claim(store, now).await.unwrap();
+        if attempt == pauses.len() {
+            let found = Checkpoint { name: "a".to_owned(), document: Vec::new() };
+            assert!(store.checkpoint(&claimed, "f", &[found]).await.unwrap());
+        }
+        assert!(store.end_job(&claimed, &retry, at(now)).await.unwrap());
+        assert!(claim(store, now + pause - 1).await.is_none(), "attempt {attempt}");
+        now += pause;
+    }
+}
+
+pub async fn a_job_that_a_worker_cannot_do_waits_for_another(store: &dyn Store) {
+    let survey = survey(store, plant(store, "A").await.id, "June").await;
+    let job = enqueue(store, &survey).await;
+    let declined = Ending::Declined { code: "c".to_owned(), message: "m".to_owned(), pause: Duration::from_secs(5) };
+    for now in [0, 5, 10, 15] {
+        let claimed = claim(store, now).await.unwrap();
+        assert_eq!(claimed.job.attempt, 1);
+        assert!(store.end_job(&claimed, &declined, at(now)).await.unwrap());
+        assert!(claim(store, now + 4).await.is_none());
+    }
+    let job = store.job(job.plant, job.id).await.unwrap().unwrap();
+    assert_eq!((job.state, job.error), (JobState::Queued, Some(("c".to_owned(), "m".to_owned()))));
 }
 
 pub async fn cancel(store: &dyn Store) {
@@ -143,7 +180,8 @@ pub async fn checkpoints_live_as_long_as_their_job(store: &dyn Store) {
     assert_eq!(store.checkpoints(job.id, "f").await.unwrap(), [kept("b")]);
     let third = claim(store, 62).await.unwrap();
     assert_eq!(third.job.attempt, 3);
-    let retry = Ending::Retry { code: "environment".to_owned(), message: "m".to_owned(), at: at(63) };
+    let backoff = Duration::ZERO;
+    let retry = Ending::Retry { code: "environment".to_owned(), message: "m".to_owned(), backoff };
     assert!(store.end_job(&third, &retry, at(63)).await.unwrap());
     assert_eq!(state(store, &job).await, JobState::Failed);
     assert!(store.checkpoints(job.id, "g").await.unwrap().is_empty());

@@ -6,6 +6,7 @@ use heliomap::store::{
     Completed, Created, DeliveryState, Ending, JobId, NewWebhook, OrganisationId, Quotas, Sent, SigningSecret, Store,
     StoreError, Webhook, WebhookId,
 };
+use std::time::Duration;
 use uuid::Uuid;
 
 async fn webhook(store: &dyn Store, organisation: OrganisationId, plant: Option<PlantId>) -> Webhook {
@@ -59,7 +60,8 @@ pub async fn webhooks(store: &dyn Store) {
                     assert!(matches!(done, Completed::Done(_)));
                 }
                 _ => {
-                    let retry = Ending::Retry { code: "code".to_owned(), message: "message".to_owned(), at: at(2) };
+                    let backoff = Duration::from_secs(1);
+                    let retry = Ending::Retry { code: "code".to_owned(), message: "message".to_owned(), backoff };
                     assert!(store.end_job(&claimed, &retry, at(1)).await.unwrap());
                     assert_eq!(messages(store, &of_a).await.len(), ended.len());
                     // Its last attempt, whose worker falls silent.
