@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Runs a command beside a Postgres server of its own, which HELIOMAP_TEST_POSTGRES names and which ends with the command:
 #   tests/with-postgres.sh cargo test
+# With HELIOMAP_TEST_TLS it takes encrypted connections alone, and HELIOMAP_TEST_POSTGRES_AUTHORITY names whom to trust.
 # Installs Postgres by apt where there is none and the user may.
 set -euo pipefail
 
@@ -30,8 +31,21 @@ cd_back=$PWD
 cd "$folder"
 "${as_user[@]}" "$bin/initdb" --pgdata="$folder/data" --username=heliomap --auth=trust --no-sync >"$folder/log" 2>&1 || { cat "$folder/log" >&2; exit 1; }
 echo "host all all $address/24 trust" >>"$folder/data/pg_hba.conf"
+options="-c listen_addresses=$address -c port=$port -c unix_socket_directories=$folder -c max_connections=300"
+if [ -n "${HELIOMAP_TEST_TLS:-}" ]; then
+    # A certificate of this address, by an authority of which nobody knows but whoever is told.
+    key=(-newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 2)
+    openssl req -x509 "${key[@]}" -subj /CN=authority -keyout authority.key -out authority.pem 2>>log
+    openssl req "${key[@]}" -subj /CN=server -keyout server.key -out server.csr 2>>log
+    openssl x509 -req -in server.csr -CA authority.pem -CAkey authority.key -days 2 -out server.pem 2>>log \
+        -extfile <(echo "subjectAltName=IP:$address")
+    [ "$(id -u)" = 0 ] && chown postgres server.key
+    sed -i 's/^host /hostssl /' "$folder/data/pg_hba.conf"
+    options+=" -c ssl=on -c ssl_cert_file=$folder/server.pem -c ssl_key_file=$folder/server.key"
+    export HELIOMAP_TEST_POSTGRES_AUTHORITY="$folder/authority.pem"
+fi
 "${as_user[@]}" "$bin/pg_ctl" --pgdata="$folder/data" --log="$folder/data/server.log" --silent --wait \
-    --options="-c listen_addresses=$address -c port=$port -c unix_socket_directories=$folder -c max_connections=300" start >/dev/null
+    --options="$options" start >/dev/null
 cd "$cd_back"
 export HELIOMAP_TEST_POSTGRES="postgres://heliomap@$address:$port"
 export HELIOMAP_TEST_POSTGRES_BIN=$bin

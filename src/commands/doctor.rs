@@ -222,6 +222,17 @@ async fn database(args: &ServeArgs) -> Check {
             "make the first key with `heliomap keys create --scope admin --name NAME`: nobody gets in without one";
         return Check::warning(NAME, format!("{found}; it holds no key"), advice);
     }
+    if let Some(url) = &args.storage.database
+        && !PostgresStore::is_guarded(url).unwrap_or(true)
+    {
+        let advice = "have the connection encrypted and its certificate checked: add ?sslmode=verify-full to --database, and \
+                      &sslrootcert=FILE where the certificate is of an authority of your own";
+        return Check::warning(
+            NAME,
+            format!("{found}; whoever is in between may read and change what is said"),
+            advice,
+        );
+    }
     Check::ok(NAME, found)
 }
 

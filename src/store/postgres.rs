@@ -6,8 +6,9 @@ mod backend;
 use super::StoreError;
 use super::schema::Examined;
 use super::sql::postgres as queues;
-use sqlx::postgres::{PgListener, PgPool, PgPoolOptions};
+use sqlx::postgres::{PgConnectOptions, PgListener, PgPool, PgPoolOptions, PgSslMode};
 use sqlx::{Postgres, Transaction};
+use std::net::IpAddr;
 use std::time::Duration;
 use tokio::sync::Notify;
 
@@ -51,6 +52,16 @@ impl PostgresStore {
         let pool = options.connect(url).await?;
         sqlx::migrate!("migrations/postgres").run(&pool).await?;
         Ok(Self { read: pool.clone(), write: pool })
+    }
+
+    /// Whether nobody in between reads or changes what is said to the database at a URL: it is on this machine, or the
+    /// connection is encrypted and its certificate checked.
+    pub fn is_guarded(url: &str) -> Result<bool, StoreError> {
+        let options: PgConnectOptions = url.parse()?;
+        let host = options.get_host();
+        let here = host == "localhost" || host.parse().is_ok_and(|address: IpAddr| address.is_loopback());
+        let is_checked = matches!(options.get_ssl_mode(), PgSslMode::VerifyCa | PgSslMode::VerifyFull);
+        Ok(here || host.starts_with('/') || options.get_socket().is_some() || is_checked)
     }
 
     /// Looks at the database at a URL without changing its schema.
@@ -101,4 +112,26 @@ impl PostgresStore {
 async fn tell_of_work(tx: &mut Tx) -> Result<(), StoreError> {
     sqlx::query("SELECT pg_notify($1, '')").bind(WORK).execute(&mut **tx).await?;
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn connections_that_nobody_reads() {
+        for (url, guarded) in [
+            ("postgres://u:p@127.0.0.1/d", true),
+            ("postgres://u:p@localhost/d?sslmode=disable", true),
+            ("postgres:///d?host=/run/postgresql", true),
+            ("postgres://u:p@db.example.org/d?sslmode=verify-full", true),
+            ("postgres://u:p@db.example.org/d?sslmode=verify-ca&sslrootcert=ca.pem", true),
+            ("postgres://u:p@db.example.org/d?sslmode=require", false),
+            ("postgres://u:p@db.example.org/d", false),
+            ("postgres://u:p@10.0.0.7/d?sslmode=prefer", false),
+        ] {
+            assert_eq!(PostgresStore::is_guarded(url).unwrap(), guarded, "{url}");
+        }
+        assert!(PostgresStore::is_guarded("postgres://u:p@h/d?sslmode=always").is_err());
+    }
 }

@@ -41,6 +41,37 @@ fn assert_fails(outcome: (bool, Vec<Value>), name: &str, found: &str) {
     assert!(!failed[0]["advice"].as_str().unwrap().is_empty());
 }
 
+/// A connection that is encrypted, and is trusted by whoever knows the authority alone.
+#[test]
+fn a_database_behind_tls() {
+    if std::env::var_os("HELIOMAP_TEST_POSTGRES").is_none() {
+        println!("skipped: no Postgres; `make unit` installs it");
+        return;
+    }
+    let data = tempfile::tempdir().unwrap();
+    let script = r#"for query in "sslmode=verify-full&sslrootcert=$HELIOMAP_TEST_POSTGRES_AUTHORITY" sslmode=require \
+        sslmode=verify-full sslmode=disable
+    do "$0" doctor --json --database "$HELIOMAP_TEST_POSTGRES/postgres?$query"; done; true"#;
+    let output = Command::new("tests/with-postgres.sh")
+        .args(["bash", "-c", script, env!("CARGO_BIN_EXE_heliomap")])
+        .current_dir(env!("CARGO_MANIFEST_DIR"))
+        .env("HELIOMAP_DATA_DIR", data.path())
+        .env("HELIOMAP_TEST_TLS", "1")
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let answers = serde_json::Deserializer::from_slice(&output.stdout).into_iter::<Vec<Value>>();
+    let databases =
+        answers.map(|checks| checks.unwrap().into_iter().find(|check| check["name"] == "database").unwrap());
+    let databases: Vec<_> = databases.map(|check| (check["verdict"].clone(), check["found"].to_string())).collect();
+    assert_eq!(databases.len(), 4, "{databases:?}");
+    for (verdict, found) in &databases[..2] {
+        assert!(verdict == "warning" && found.contains("answers and is empty"), "{databases:?}");
+    }
+    assert!(databases[2].0 == "failed" && databases[2].1.contains("certificate"), "{databases:?}");
+    assert!(databases[3].0 == "failed" && databases[3].1.contains("no encryption"), "{databases:?}");
+}
+
 #[test]
 fn a_service_that_is_well() {
     let data = healthy();
