@@ -1,7 +1,7 @@
 //! Bytes: content-addressed within a plant, so that what is stored once is never half-written, a plant's deletion
 //! deletes everything of it, and nobody learns from an upload what another plant holds.
 
-use super::{Bucket, StoreError, UploadId};
+use super::{Bucket, StoreError, UploadId, pieces};
 use crate::plant::PlantId;
 use futures::TryStreamExt;
 use object_store::aws::AmazonS3Builder;
@@ -21,6 +21,7 @@ use tempfile::TempPath;
 use tokio::io::AsyncWriteExt;
 use tokio::sync::Semaphore;
 use tokio_util::io::ReaderStream;
+use uuid::Uuid;
 
 /// A blob goes to a bucket in parts of so many bytes: 10,000 of them, which is the most, make 160 GiB.
 const PART_BYTES: usize = 16 << 20;
@@ -92,14 +93,16 @@ pub struct StagedFile {
 /// The blob store.
 #[derive(Debug, Clone)]
 pub struct Blobs {
-    store: Arc<dyn ObjectStore>,
+    pub(super) store: Arc<dyn ObjectStore>,
     /// Where the store is a folder of this machine: a staged file is renamed into it, and a blob is handed out as a
     /// hard link, without copying either.
     local: Option<PathBuf>,
-    staging: PathBuf,
+    pub(super) staging: PathBuf,
     uploads: PathBuf,
+    /// What this data folder is called among those of a bucket.
+    pub(super) home: Option<Uuid>,
     /// One permit for each blob that may be on its way to a bucket.
-    senders: Arc<Semaphore>,
+    pub(super) senders: Arc<Semaphore>,
 }
 
 impl Blobs {
@@ -124,12 +127,21 @@ impl Blobs {
         for folder in [&staging, &uploads] {
             std::fs::create_dir_all(folder).map_err(io("create the folder", folder))?;
         }
-        Ok(Self { store, local, staging, uploads, senders: Arc::new(Semaphore::new(SENDERS)) })
+        let home = match &local {
+            Some(_) => None,
+            None => Some(pieces::name_of(data).map_err(io("name the folder", data))?),
+        };
+        Ok(Self { store, local, staging, uploads, home, senders: Arc::new(Semaphore::new(SENDERS)) })
     }
 
     /// The local folder for files on their way in and for the folders of running jobs.
     pub fn staging(&self) -> &Path {
         &self.staging
+    }
+
+    /// What this data folder is called, where others may have the bytes of an upload.
+    pub fn home(&self) -> Option<Uuid> {
+        self.home
     }
 
     /// Where the bytes of an upload that may be resumed lie until they are whole.
@@ -140,6 +152,7 @@ impl Blobs {
     /// Deletes the bytes of uploads that are not known, but for those so young that they may be just beginning.
     pub async fn sweep_uploads(&self, known: HashSet<UploadId>, young: Duration) -> Result<(), StoreError> {
         let known: HashSet<String> = known.iter().map(UploadId::to_string).collect();
+        self.sweep_pieces(&known, young).await?;
         let uploads = self.uploads.clone();
         run_blocking("clean the folder", uploads.clone(), move || {
             for entry in std::fs::read_dir(&uploads)? {

@@ -8,6 +8,7 @@ pub mod blobs;
 pub mod bucket;
 pub mod freeing;
 pub mod name;
+pub mod pieces;
 pub mod postgres;
 pub mod records;
 pub mod requests;

@@ -224,12 +224,12 @@ pub const PHOTOS_OF_DIGEST: &str = "\
     SELECT path FROM files WHERE survey_id = $1 AND sha256 = $2 AND kind = 'image' ORDER BY path LIMIT $3";
 
 pub const CREATE_UPLOAD: &str = "\
-    INSERT INTO uploads (id, survey_id, length, received, partial, metadata, expires_ms, parts) \
-    VALUES ($1, $2, $3, $4, $5, $6, $7, $8)";
+    INSERT INTO uploads (id, survey_id, length, received, partial, metadata, expires_ms, parts, home) \
+    VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9)";
 macro_rules! upload {
     ($parts:literal) => {
         concat!(
-            "SELECT id, survey_id, length, received, partial, metadata, expires_ms, outcome, ",
+            "SELECT id, survey_id, length, received, partial, metadata, expires_ms, outcome, home, ",
             $parts,
             " AS parts FROM uploads WHERE survey_id = $1 AND "
         )
@@ -238,7 +238,8 @@ macro_rules! upload {
 pub const UPLOAD: &str = concat!(upload!("parts"), "id = $2");
 pub const UPLOADS_OF_SURVEY: &str =
     concat!(upload!("CAST(NULL AS TEXT)"), "id > $2 AND expires_ms > $4 ORDER BY id LIMIT $3");
-pub const UPLOAD_RECEIVED: &str = "UPDATE uploads SET received = $2, expires_ms = $3 WHERE id = $1";
+pub const UPLOAD_RECEIVED: &str =
+    "UPDATE uploads SET received = $2, expires_ms = $3, home = $4 WHERE id = $1 AND received = $5";
 pub const END_UPLOAD: &str = "UPDATE uploads SET outcome = $2 WHERE id = $1";
 pub const DELETE_UPLOAD: &str = "DELETE FROM uploads WHERE survey_id = $1 AND id = $2";
 pub const DELETE_EXPIRED_UPLOADS: &str = "DELETE FROM uploads WHERE expires_ms <= $1";

@@ -30,6 +30,8 @@ pub struct Upload {
     pub expires: Timestamp,
     /// What became of the whole file, JSON.
     pub outcome: Option<String>,
+    /// The data folder that has its bytes, where others share the bucket ([`Blobs::home`](super::Blobs::home)).
+    pub home: Option<Uuid>,
 }
 
 /// What an upload that begins must keep to.
@@ -65,8 +67,15 @@ pub trait UploadStore: Send + Sync + 'static {
         limit: u32,
         now: Timestamp,
     ) -> Result<Vec<Upload>, StoreError>;
-    /// Notes how many bytes are safe, and a new end of its life; `false` where the upload is gone.
-    async fn upload_received(&self, id: UploadId, received: u64, expires: Timestamp) -> Result<bool, StoreError>;
+    /// Notes how many bytes are safe, in which data folder, and a new end of its life; `false` where the upload is gone, or
+    /// is not as it was told.
+    async fn upload_received(
+        &self,
+        upload: &Upload,
+        received: u64,
+        home: Option<Uuid>,
+        expires: Timestamp,
+    ) -> Result<bool, StoreError>;
     /// Notes what became of the whole file, JSON.
     async fn end_upload(&self, id: UploadId, outcome: &str) -> Result<(), StoreError>;
     /// Forgets an upload; whether there was one.

@@ -7,6 +7,7 @@ mod boxes;
 mod configuration;
 mod doctor;
 mod traces;
+mod uploads;
 
 use heliomap::store::{Digest, SqliteStore, SurveyId, Upload, UploadId, UploadStore};
 use jiff::SignedDuration;
@@ -188,6 +189,7 @@ fn uploads_whose_time_is_over_are_forgotten_while_the_service_runs() {
         metadata: "filename YS5qcGc=".to_owned(),
         expires: jiff::Timestamp::now() + expires,
         outcome: None,
+        home: None,
     };
     let over = upload(1, SignedDuration::from_secs(-1));
     let goes_on = upload(2, SignedDuration::from_hours(1));

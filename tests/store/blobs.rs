@@ -43,11 +43,16 @@ on_both!(
     a_deleted_blob_leaves_the_others,
     a_deleted_plant_leaves_nothing,
     what_is_missing_is_told,
-    uploads_on_their_way_stay_on_this_machine,
+    uploads_on_their_way_are_swept_once_nobody_knows_them,
 );
 
 /// Blobs in a part of their own of the test server's bucket.
 fn in_bucket(data: &Path) -> Option<Blobs> {
+    beside_each_other(&[data])?.pop()
+}
+
+/// Blobs in one part of that bucket for servers with data folders of their own.
+fn beside_each_other(data: &[&Path]) -> Option<Vec<Blobs>> {
     let Ok(endpoint) = std::env::var("HELIOMAP_TEST_S3") else {
         println!("skipped: no S3-compatible server; `make unit` starts one, and so does tests/with-s3.sh");
         return None;
@@ -57,7 +62,7 @@ fn in_bucket(data: &Path) -> Option<Blobs> {
         .with_endpoint(endpoint)
         .with_access_key_id("heliomap")
         .with_secret_access_key("heliomap-secret");
-    Some(Blobs::in_bucket(data, &bucket, settings).unwrap())
+    Some(data.iter().map(|data| Blobs::in_bucket(data, &bucket, settings.clone()).unwrap()).collect())
 }
 
 fn plant(number: u128) -> PlantId {
@@ -148,7 +153,7 @@ async fn what_is_missing_is_told(blobs: &Blobs, data: &Path) {
     assert!(blobs.place(plant(1), missing, &data.join("placed")).await.is_err());
 }
 
-async fn uploads_on_their_way_stay_on_this_machine(blobs: &Blobs, data: &Path) {
+async fn uploads_on_their_way_are_swept_once_nobody_knows_them(blobs: &Blobs, data: &Path) {
     let (known, unknown) = (UploadId(Uuid::from_u128(1)), UploadId(Uuid::from_u128(2)));
     for id in [known, unknown] {
         std::fs::write(blobs.upload_file(id), b"half a pho").unwrap();
@@ -181,4 +186,47 @@ async fn a_damaged_blob_is_not_handed_out_and_is_whole_once_its_bytes_come_again
     }
     assert_eq!(std::fs::read(&held).unwrap(), b"a model");
     assert!(std::fs::metadata(&file).unwrap().permissions().readonly());
+}
+
+#[tokio::test]
+async fn an_upload_goes_on_at_another_server() {
+    let [here, there] = [(); 2].map(|()| tempfile::tempdir().unwrap());
+    let Some(servers) = beside_each_other(&[here.path(), there.path()]) else { return };
+    let [here, there] = &servers[..] else { panic!("there are two") };
+    assert!(here.home().is_some() && here.home() != there.home());
+    let id = UploadId(Uuid::from_u128(1));
+    let bytes: Vec<u8> = (0..20_000_000_u32).map(|k| (k.wrapping_mul(2_654_435_761) >> 24) as u8).collect();
+    let room = || Ok(());
+    assert!(there.bring_upload(id, 0, room).await.unwrap(), "nothing came yet");
+
+    std::fs::write(here.upload_file(id), &bytes).unwrap();
+    // Larger than one piece, and one whose end was not told any more.
+    here.keep_pieces(id, 0, 18_000_000).await.unwrap();
+    here.keep_pieces(id, 18_000_000, 19_000_000).await.unwrap();
+    assert!(!there.has_pieces(id, 19_000_001).await.unwrap());
+    assert!(!there.bring_upload(id, 20_000_000, room).await.unwrap());
+    let full = || Err(std::io::ErrorKind::StorageFull.into());
+    assert!(there.bring_upload(id, 18_000_000, full).await.unwrap_err().is_full());
+    assert!(there.bring_upload(id, 18_000_000, room).await.unwrap());
+    assert!(std::fs::read(there.upload_file(id)).unwrap() == bytes[..18_000_000]);
+
+    // It goes on there from what counted, and here again.
+    std::fs::write(there.upload_file(id), &bytes).unwrap();
+    there.keep_pieces(id, 18_000_000, 20_000_000).await.unwrap();
+    assert!(here.has_pieces(id, 20_000_000).await.unwrap());
+    std::fs::remove_file(here.upload_file(id)).unwrap();
+    assert!(here.bring_upload(id, 20_000_000, room).await.unwrap());
+    assert!(std::fs::read(here.upload_file(id)).unwrap() == bytes);
+    assert_eq!(files_below(here.staging()) + files_below(there.staging()), 0);
+
+    // Once nobody knows it, its pieces go.
+    there.sweep_uploads(HashSet::from([id]), Duration::ZERO).await.unwrap();
+    assert!(there.has_pieces(id, 1).await.unwrap());
+    there.sweep_uploads(HashSet::new(), Duration::from_secs(3600)).await.unwrap();
+    assert!(there.has_pieces(id, 1).await.unwrap(), "it may be just beginning");
+    there.sweep_uploads(HashSet::new(), Duration::ZERO).await.unwrap();
+    assert!(!there.has_pieces(id, 1).await.unwrap());
+    here.keep_pieces(id, 0, 10).await.unwrap();
+    here.drop_upload(id).await;
+    assert!(!here.upload_file(id).exists() && !here.has_pieces(id, 1).await.unwrap());
 }

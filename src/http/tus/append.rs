@@ -2,7 +2,7 @@
 
 use super::finish::finish;
 use super::protocol::{Checksum, UPLOAD_EXPIRES, UPLOAD_OFFSET, answer, http_date, number, text, wrong};
-use super::{LIFE, UploadPath, found, require_here, take_over};
+use super::{LIFE, UploadPath, bring_here, found, take_over};
 use crate::http::AppState;
 use crate::http::error::{ApiError, Code, Problem};
 use crate::http::extract::ApiPath;
@@ -70,7 +70,7 @@ pub(super) async fn add(
     announced.require_fits(&upload)?;
     // Whoever had it may have made more safe on the way out.
     let (taken, mut upload) = take_over(state, path).await?;
-    require_here(state, &upload).await?;
+    bring_here(state, &upload).await?;
     announced.require_fits(&upload)?;
     let body = body.into_data_stream();
     match upload.received == upload.length {
@@ -152,6 +152,10 @@ fn line_broke() -> ApiError {
     ApiError::new(Code::UploadInterrupted, "the line broke; ask with HEAD where to go on")
 }
 
+fn taken_over() -> ApiError {
+    ApiError::new(Code::UploadInterrupted, "a newer request goes on with this upload")
+}
+
 fn stalled() -> ApiError {
     ApiError::new(Code::UploadStalled, "nothing came; ask with HEAD where to go on")
 }
@@ -176,7 +180,7 @@ async fn receive(
     let broken = loop {
         let next = tokio::select! {
             () = interrupt.cancelled() => {
-                break Some(ApiError::new(Code::UploadInterrupted, "a newer request goes on with this upload"));
+                break Some(taken_over());
             }
             next = tokio::time::timeout(idle, body.next()) => next,
         };
@@ -219,10 +223,14 @@ async fn secure(
 ) -> Result<(), ApiError> {
     file.flush().await.map_err(|error| disk(path, error))?;
     file.get_ref().sync_data().await.map_err(|error| disk(path, error))?;
-    upload.received = at;
-    upload.expires = Timestamp::now() + LIFE;
-    if !state.store.upload_received(upload.id, at, upload.expires).await? {
-        return Err(ApiError::new(Code::UploadNotFound, "the upload was ended meanwhile"));
+    state.blobs.keep_pieces(upload.id, upload.received, at).await?;
+    let (home, expires) = (state.blobs.home(), Timestamp::now() + LIFE);
+    if !state.store.upload_received(upload, at, home, expires).await? {
+        return Err(match state.store.upload(upload.survey, upload.id).await? {
+            None => ApiError::new(Code::UploadNotFound, "the upload was ended meanwhile"),
+            Some(_) => taken_over(),
+        });
     }
+    (upload.received, upload.home, upload.expires) = (at, home, expires);
     Ok(())
 }

@@ -1,9 +1,9 @@
 //! Uploads begin, or are put together from their parts.
 
-use super::finish::{finish, remove};
+use super::finish::finish;
 use super::place::Place;
 use super::protocol::{UPLOAD_EXPIRES, answer, http_date, number, require_version, text, wrong};
-use super::{LIFE, place, require_here, require_upload};
+use super::{LIFE, bring_here, place, require_upload};
 use crate::http::AppState;
 use crate::http::error::{ApiError, Problem};
 use crate::http::extract::ApiPath;
@@ -120,11 +120,12 @@ async fn create_upload(
         metadata: metadata.to_owned(),
         expires: Timestamp::now() + LIFE,
         outcome: None,
+        home: state.blobs.home(),
     };
     // What its parts announced is counted already.
     let bounds = parts.is_none().then_some(&bounds);
     if let Err(error) = state.store.create_upload(&upload, bounds, Timestamp::now()).await {
-        remove(&file).await;
+        state.blobs.drop_upload(id).await;
         return Err(error.into());
     }
     if upload.received == length {
@@ -132,7 +133,7 @@ async fn create_upload(
     }
     for part in parts.iter().flatten() {
         state.store.delete_upload(survey, part.id).await?;
-        remove(&state.blobs.upload_file(part.id)).await;
+        state.blobs.drop_upload(part.id).await;
     }
     let headers = [(header::LOCATION, place(plant, survey, id)), (UPLOAD_EXPIRES, http_date(upload.expires))];
     Ok((StatusCode::CREATED, headers).into_response())
@@ -161,7 +162,7 @@ async fn finished_parts(state: &AppState, survey: SurveyId, urls: &str) -> Resul
         if !part.partial || part.received < part.length {
             return Err(wrong(format!("{url} is no part that is whole")));
         }
-        require_here(state, &part).await?;
+        bring_here(state, &part).await?;
         if !named.insert(part.id) {
             return Err(wrong(format!("{url} is named twice")));
         }

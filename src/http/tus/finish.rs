@@ -8,7 +8,6 @@ use crate::http::intake::{self, disk};
 use crate::http::uploads::{self, UploadedFile};
 use crate::plant::PlantId;
 use crate::store::{Digest, StagedFile, Upload};
-use std::path::Path;
 use uuid::Uuid;
 
 /// Checks a whole file and stores it in its survey, once; a part waits for the others.
@@ -24,7 +23,7 @@ pub(super) async fn finish(state: &AppState, plant: PlantId, upload: &Upload) ->
         Err(problem) => Outcome { files: Vec::new(), problem: Some(problem.document()) },
     };
     state.store.end_upload(upload.id, &serde_json::json!(outcome).to_string()).await?;
-    remove(&state.blobs.upload_file(upload.id)).await;
+    state.blobs.drop_upload(upload.id).await;
     stored.map(drop)
 }
 
@@ -47,14 +46,5 @@ async fn store_whole(state: &AppState, plant: PlantId, upload: &Upload) -> Resul
             let stored = intake::store(state, plant, upload.survey, vec![checked], None).await?;
             Ok(stored.into_iter().map(uploads::uploaded).collect())
         }
-    }
-}
-
-/// Deletes a file; one that cannot be deleted now is swept up later.
-pub(super) async fn remove(path: &Path) {
-    if let Err(error) = tokio::fs::remove_file(path).await
-        && error.kind() != std::io::ErrorKind::NotFound
-    {
-        tracing::warn!(%error, path = %path.display(), "an upload's file cannot be deleted");
     }
 }

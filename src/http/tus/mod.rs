@@ -22,14 +22,14 @@ use super::extract::ApiPath;
 use super::intake::disk;
 use super::uploads::UploadedFile;
 use crate::plant::PlantId;
-use crate::store::{SurveyId, Upload, UploadId};
+use crate::store::{SurveyId, Upload, UploadId, keep_free};
 use axum::Json;
 use axum::body::Body;
 use axum::extract::State;
 use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use desk::Taken;
-use finish::{finish, remove};
+use finish::finish;
 use jiff::{SignedDuration, Timestamp};
 use place::Place;
 use protocol::{ALGORITHMS, EXTENSIONS, UPLOAD_EXPIRES, UPLOAD_OFFSET, VERSION, answer, http_date, require_version};
@@ -170,15 +170,36 @@ async fn require_upload(state: &AppState, survey: SurveyId, id: UploadId) -> Res
     })
 }
 
-/// Refuses to go on with an upload whose bytes are not here: they are on the disk of the machine where it began.
-async fn require_here(state: &AppState, upload: &Upload) -> Result<(), ApiError> {
+/// Whether the file of an upload is in this machine's data folder, with all bytes that count.
+async fn is_here(state: &AppState, upload: &Upload) -> Result<bool, ApiError> {
     let file = state.blobs.upload_file(upload.id);
-    if upload.outcome.is_some() || tokio::fs::try_exists(&file).await.map_err(|error| disk(&file, error))? {
+    let length = match tokio::fs::metadata(&file).await {
+        Ok(found) => Some(found.len()),
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => None,
+        Err(error) => return Err(disk(&file, error)),
+    };
+    let at_home = upload.home.is_none() || upload.home == state.blobs.home();
+    Ok(upload.outcome.is_some() || (at_home && length.is_some_and(|length| length >= upload.received)))
+}
+
+/// Brings the bytes of an upload here where another server took them.
+async fn bring_here(state: &AppState, upload: &Upload) -> Result<(), ApiError> {
+    let (staging, reserve) = (state.blobs.staging(), state.limits.disk_reserve);
+    let has_room = || keep_free(staging, reserve);
+    if is_here(state, upload).await? || state.blobs.bring_upload(upload.id, upload.received, has_room).await? {
         return Ok(());
     }
-    let detail =
-        "the upload's bytes are not on this machine: send its requests to the one where it began, or begin a new one";
-    Err(ApiError::new(Code::UploadNotFound, detail))
+    Err(nowhere())
+}
+
+/// Refuses to go on with an upload whose bytes are neither here nor can be brought here.
+async fn require_somewhere(state: &AppState, upload: &Upload) -> Result<(), ApiError> {
+    let somewhere = is_here(state, upload).await? || state.blobs.has_pieces(upload.id, upload.received).await?;
+    if somewhere { Ok(()) } else { Err(nowhere()) }
+}
+
+fn nowhere() -> ApiError {
+    ApiError::new(Code::UploadNotFound, "the upload's bytes are not on this machine any more: begin a new one")
 }
 
 /// What this service speaks of the tus protocol
@@ -232,9 +253,11 @@ pub async fn head(State(state): State<AppState>, ApiPath(path): ApiPath<UploadPa
 
 async fn tell(state: &AppState, path: &UploadPath, headers: &HeaderMap) -> Result<Response, ApiError> {
     let (_taken, upload) = take(state, path, headers).await?;
-    require_here(state, &upload).await?;
     if upload.received == upload.length {
+        bring_here(state, &upload).await?;
         finish(state, path.plant, &upload).await?;
+    } else {
+        require_somewhere(state, &upload).await?;
     }
     let mut answer = HeaderMap::new();
     answer.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
@@ -309,7 +332,7 @@ pub async fn terminate(
 async fn end(state: &AppState, path: &UploadPath, headers: &HeaderMap) -> Result<Response, ApiError> {
     let (_taken, upload) = take(state, path, headers).await?;
     state.store.delete_upload(path.survey, upload.id).await?;
-    remove(&state.blobs.upload_file(upload.id)).await;
+    state.blobs.drop_upload(upload.id).await;
     Ok(StatusCode::NO_CONTENT.into_response())
 }
 

@@ -127,6 +127,7 @@ pub fn upload(row: &Row) -> Result<Upload, StoreError> {
         metadata: row.try_get("metadata")?,
         expires: time(row, "expires_ms")?,
         outcome: row.try_get("outcome")?,
+        home: row.try_get::<Option<&str>, _>("home")?.map(|_| uuid(row, "home")).transpose()?,
     })
 }
 

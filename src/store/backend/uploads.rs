@@ -7,6 +7,7 @@ use crate::store::{StoreError, SurveyId, Upload, UploadBounds, UploadId, UploadS
 use async_trait::async_trait;
 use jiff::Timestamp;
 use sqlx::Row as _;
+use uuid::Uuid;
 
 #[async_trait]
 impl UploadStore for Rows {
@@ -29,6 +30,7 @@ impl UploadStore for Rows {
             .bind(&upload.metadata)
             .bind(upload.expires.as_millisecond())
             .bind(&upload.parts)
+            .bind(upload.home.map(|home| home.to_string()))
             .execute(&mut *tx)
             .await
             .map_err(super::gone("survey"))?;
@@ -56,9 +58,20 @@ impl UploadStore for Rows {
         query.fetch_all(&self.read).await?.iter().map(read::upload).collect()
     }
 
-    async fn upload_received(&self, id: UploadId, received: u64, expires: Timestamp) -> Result<bool, StoreError> {
-        let query = sqlx::query(sql::UPLOAD_RECEIVED).bind(id.to_string()).bind(received as i64);
-        Ok(query.bind(expires.as_millisecond()).execute(&self.write).await?.rows_affected() > 0)
+    async fn upload_received(
+        &self,
+        upload: &Upload,
+        received: u64,
+        home: Option<Uuid>,
+        expires: Timestamp,
+    ) -> Result<bool, StoreError> {
+        let query = sqlx::query(sql::UPLOAD_RECEIVED)
+            .bind(upload.id.to_string())
+            .bind(received as i64)
+            .bind(expires.as_millisecond())
+            .bind(home.map(|home| home.to_string()))
+            .bind(upload.received as i64);
+        Ok(query.execute(&self.write).await?.rows_affected() > 0)
     }
 
     async fn end_upload(&self, id: UploadId, outcome: &str) -> Result<(), StoreError> {

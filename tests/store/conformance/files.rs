@@ -74,14 +74,19 @@ pub async fn uploads(store: &dyn Store) {
         metadata: "filename YS5qcGc=".to_owned(),
         expires: at(100),
         outcome: None,
+        home: None,
     };
     store.create_upload(&upload, None, at(0)).await.unwrap();
     assert_eq!(store.upload(survey.id, id).await.unwrap(), Some(upload.clone()));
     assert_eq!(store.upload(SurveyId(Uuid::nil()), id).await.unwrap(), None);
-    assert!(store.upload_received(id, 1 << 33, at(200)).await.unwrap());
-    assert!(!store.upload_received(UploadId(Uuid::nil()), 1, at(200)).await.unwrap());
+    let home = Some(Uuid::from_u128(8));
+    assert!(store.upload_received(&upload, 1 << 33, home, at(200)).await.unwrap());
+    // Who does not know of that, on another server, does not count on.
+    assert!(!store.upload_received(&upload, 1 << 32, None, at(300)).await.unwrap());
+    let unknown = Upload { id: UploadId(Uuid::nil()), ..upload.clone() };
+    assert!(!store.upload_received(&unknown, 1, None, at(200)).await.unwrap());
     store.end_upload(id, "{}").await.unwrap();
-    (upload.received, upload.expires, upload.outcome) = (1 << 33, at(200), Some("{}".to_owned()));
+    (upload.received, upload.home, upload.expires, upload.outcome) = (1 << 33, home, at(200), Some("{}".to_owned()));
     assert_eq!(store.upload(survey.id, id).await.unwrap(), Some(upload.clone()));
     let ids = (1..=3).map(|number| UploadId(Uuid::from_u128(number << 64))).collect::<Vec<_>>();
     for (id, expires) in ids.iter().zip([150, 150, 100]) {

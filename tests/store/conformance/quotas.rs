@@ -50,6 +50,7 @@ pub async fn quotas(store: &dyn Store) {
         metadata: String::new(),
         expires: at(expires),
         outcome: outcome.then(|| "{}".to_owned()),
+        home: None,
     };
     for upload in [upload(1, 7, false, 9), upload(2, 70, true, 9), upload(3, 700, false, 4)] {
         store.create_upload(&upload, None, at(0)).await.unwrap();
