@@ -71,6 +71,8 @@ pub struct ServeArgs {
     #[command(flatten)]
     pub jobs: JobArgs,
     #[command(flatten)]
+    pub stop: StopArgs,
+    #[command(flatten)]
     pub network: NetworkArgs,
     #[command(flatten)]
     pub webhooks: WebhookArgs,
@@ -136,6 +138,8 @@ pub struct WorkerArgs {
     pub detector: DetectorArgs,
     #[command(flatten)]
     pub jobs: JobArgs,
+    #[command(flatten)]
+    pub stop: StopArgs,
 }
 
 /// How long what nothing needs any more is kept.
@@ -156,6 +160,14 @@ pub struct JobArgs {
     /// Seconds after which a job whose worker fell silent is taken up by another.
     #[arg(long, env = "HELIOMAP_LEASE", default_value = "30", value_parser = parse_seconds, value_name = "SECONDS")]
     pub lease: Duration,
+}
+
+/// How a service ends.
+#[derive(Debug, Clone, Args)]
+pub struct StopArgs {
+    /// Seconds that requests in progress have to end once the process is told to stop; jobs go back to the queue at once.
+    #[arg(long, env = "HELIOMAP_GRACE", default_value = "20", value_parser = parse_seconds, value_name = "SECONDS")]
+    pub grace: Duration,
 }
 
 /// `heliomap doctor`.

@@ -45,9 +45,6 @@ const OLD_DELIVERIES: Duration = Duration::from_secs(30 * 24 * 3600);
 /// How often, at the least, it is looked for what is over.
 const TIDY_EVERY: Duration = Duration::from_secs(600);
 
-/// How long work in progress may take to end once the process was told to stop.
-const GRACE: Duration = Duration::from_secs(20);
-
 /// What is said of a data folder that cannot be used.
 fn unusable(folder: &Path) -> String {
     format!("cannot use the data folder {}; choose another with --data-dir", folder.display())

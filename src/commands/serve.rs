@@ -2,8 +2,7 @@
 
 use super::output::print;
 use super::{
-    GRACE, keep_tidy, open_storage, pipeline_mapper, pipeline_worker, run_async, send_messages, serve_metrics,
-    stop_signal,
+    keep_tidy, open_storage, pipeline_mapper, pipeline_worker, run_async, send_messages, serve_metrics, stop_signal,
 };
 use anyhow::Context;
 use heliomap::config::ServeArgs;
@@ -84,7 +83,7 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
             }
             anyhow::Ok(())
         };
-        match tokio::time::timeout(GRACE, ending).await {
+        match tokio::time::timeout(args.stop.grace, ending).await {
             Ok(outcome) => outcome,
             Err(_) => {
                 tracing::warn!("some requests or a job did not end in time; jobs left behind are taken up again");

@@ -2,8 +2,7 @@
 
 use super::output::print;
 use super::{
-    GRACE, keep_tidy, open_storage, pipeline_mapper, pipeline_worker, run_async, send_messages, serve_metrics,
-    stop_signal,
+    keep_tidy, open_storage, pipeline_mapper, pipeline_worker, run_async, send_messages, serve_metrics, stop_signal,
 };
 use heliomap::config::WorkerArgs;
 use heliomap::telemetry::metrics::{Metrics, Scrape};
@@ -30,7 +29,7 @@ pub fn run(args: WorkerArgs) -> anyhow::Result<()> {
         tokio::pin!(work);
         tokio::select! {
             () = &mut work => {}
-            () = stop.cancelled() => { let _ = tokio::time::timeout(GRACE, work).await; }
+            () = stop.cancelled() => { let _ = tokio::time::timeout(args.stop.grace, work).await; }
         }
         Ok(())
     })

@@ -1,5 +1,6 @@
 //! Whose tokens let in beside keys.
 
+use crate::oidc::keys::Ages;
 use crate::oidc::{OidcSettings, OrganisationRule};
 use crate::store::Scope;
 use clap::Args;
@@ -52,7 +53,7 @@ impl OidcArgs {
             organisation,
             scope_claim: self.oidc_scope_claim.clone(),
             scopes: self.oidc_scope.clone(),
-            min_refresh: MIN_KEY_REFRESH,
+            ages: Ages::with_min_refresh(MIN_KEY_REFRESH),
         }))
     }
 }

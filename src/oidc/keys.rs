@@ -11,7 +11,9 @@ use std::time::{Duration, Instant};
 use tokio::sync::Mutex;
 
 /// How long keys are kept without asking whether they still hold.
-const MAX_AGE: Duration = Duration::from_secs(3600);
+const FRESH: Duration = Duration::from_secs(3600);
+/// How long keys hold of which the provider cannot be asked.
+const MAX_AGE: Duration = Duration::from_secs(24 * 3600);
 /// How long a fetch may take.
 const TIMEOUT: Duration = Duration::from_secs(5);
 /// Largest answer of the provider, bytes.
@@ -49,21 +51,39 @@ struct Kept {
     failure: Option<KeyError>,
 }
 
+/// How old keys may be.
+#[derive(Debug, Clone, Copy)]
+pub struct Ages {
+    /// The least time between two fetches.
+    pub min_refresh: Duration,
+    /// For so long nobody is asked whether they still hold.
+    pub fresh: Duration,
+    /// So old they hold no more.
+    pub most: Duration,
+}
+
+impl Ages {
+    /// The usual ones, but for the least time between two fetches.
+    pub fn with_min_refresh(min_refresh: Duration) -> Self {
+        Self { min_refresh, fresh: FRESH, most: MAX_AGE }
+    }
+}
+
 /// The provider's keys.
 #[derive(Debug)]
 pub struct Keys {
     issuer: String,
     discovery: Url,
     client: Client,
-    min_refresh: Duration,
+    ages: Ages,
     /// Held by whoever fetches.
     turn: Mutex<()>,
     kept: RwLock<Arc<Kept>>,
 }
 
 impl Kept {
-    fn is_fresh(&self) -> bool {
-        self.fetched.is_some_and(|fetched| fetched.elapsed() < MAX_AGE)
+    fn is_younger(&self, age: Duration) -> bool {
+        self.fetched.is_some_and(|fetched| fetched.elapsed() < age)
     }
 }
 
@@ -81,37 +101,50 @@ struct KeySet {
 
 impl Keys {
     /// The keys of an issuer, which is not asked yet.
-    pub fn new(issuer: &str, min_refresh: Duration) -> Result<Self, KeyError> {
+    pub fn new(issuer: &str, ages: Ages) -> Result<Self, KeyError> {
         let discovery = checked(&format!("{}/.well-known/openid-configuration", issuer.trim_end_matches('/')))?;
         crate::tls::provide();
         let client = Client::builder().timeout(TIMEOUT).redirect(redirect::Policy::none()).build();
         let client = client.map_err(|error| KeyError::Client(error.to_string()))?;
         let (turn, kept) = (Mutex::default(), RwLock::default());
-        Ok(Self { issuer: issuer.to_owned(), discovery, client, min_refresh, turn, kept })
+        Ok(Self { issuer: issuer.to_owned(), discovery, client, ages, turn, kept })
     }
 
-    /// The key of this identifier for this algorithm; without an identifier, the only one for the algorithm.
-    pub async fn key(&self, id: Option<&str>, algorithm: Algorithm) -> Result<Option<DecodingKey>, KeyError> {
+    /// The key of this identifier for this algorithm; without an identifier, the only one for the algorithm. One that is
+    /// known keeps nobody waiting: whether it still holds is asked beside.
+    pub async fn key(
+        self: &Arc<Self>,
+        id: Option<&str>,
+        algorithm: Algorithm,
+    ) -> Result<Option<DecodingKey>, KeyError> {
         let known = self.kept();
-        if let Some(key) = pick(&known.keys, id, algorithm).filter(|_| known.is_fresh()) {
+        if let Some(key) = pick(&known.keys, id, algorithm).filter(|_| known.is_younger(self.ages.most)) {
+            let asked = self.turn.try_lock().is_err() || self.tried_lately(&known);
+            if !known.is_younger(self.ages.fresh) && !asked {
+                let keys = self.clone();
+                tokio::spawn(async move { keys.refresh_unless_lately().await });
+            }
             return Ok(Some(key));
         }
         // Whoever comes while keys are being fetched waits for them.
-        let _turn = self.turn.lock().await;
+        self.refresh_unless_lately().await;
         let known = self.kept();
-        let found = pick(&known.keys, id, algorithm);
-        let soon = known.tried.is_some_and(|tried| tried.elapsed() < self.min_refresh);
-        if soon || (found.is_some() && known.is_fresh()) {
-            return match (&known.failure, known.keys.is_empty()) {
-                (Some(failure), true) => Err(failure.clone()),
-                _ => Ok(found),
-            };
+        let holds = known.is_younger(self.ages.most);
+        match &known.failure {
+            Some(failure) if !holds => Err(failure.clone()),
+            _ => Ok(pick(&known.keys, id, algorithm).filter(|_| holds)),
         }
-        match self.refresh().await {
-            Ok(_) => Ok(pick(&self.kept().keys, id, algorithm)),
-            // Those that are there go on to hold.
-            Err(error) if known.keys.is_empty() => Err(error),
-            Err(_) => Ok(found),
+    }
+
+    fn tried_lately(&self, kept: &Kept) -> bool {
+        kept.tried.is_some_and(|tried| tried.elapsed() < self.ages.min_refresh)
+    }
+
+    async fn refresh_unless_lately(&self) {
+        let _turn = self.turn.lock().await;
+        if !self.tried_lately(&self.kept()) {
+            // Why it failed is kept.
+            let _ = self.refresh().await;
         }
     }
 

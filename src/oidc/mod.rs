@@ -7,10 +7,10 @@ mod crypto;
 
 use crate::store::Scope;
 use jsonwebtoken::{Algorithm, Validation, decode, decode_header};
-use keys::{KeyError, Keys};
+use keys::{Ages, KeyError, Keys};
 use serde_json::Value;
 use std::collections::BTreeSet;
-use std::time::Duration;
+use std::sync::Arc;
 
 /// Longest token, bytes.
 const MAX_TOKEN_BYTES: usize = 16 << 10;
@@ -31,8 +31,8 @@ pub struct OidcSettings {
     pub scope_claim: String,
     /// What a word of that claim stands for.
     pub scopes: Vec<(String, Scope)>,
-    /// The least time between two fetches of the provider's keys.
-    pub min_refresh: Duration,
+    /// How old the provider's keys may be.
+    pub ages: Ages,
 }
 
 /// Which organisation a caller belongs to.
@@ -73,7 +73,7 @@ fn refused(what: impl Into<String>) -> OidcError {
 #[derive(Debug)]
 pub struct Oidc {
     settings: OidcSettings,
-    keys: Keys,
+    keys: Arc<Keys>,
 }
 
 impl Oidc {
@@ -83,7 +83,7 @@ impl Oidc {
     /// Where the issuer is no URL that keys may be fetched from, or the system gives no certificates to check it by.
     pub fn new(settings: OidcSettings) -> Result<Self, KeyError> {
         crypto::provide();
-        let keys = Keys::new(&settings.issuer, settings.min_refresh)?;
+        let keys = Arc::new(Keys::new(&settings.issuer, settings.ages)?);
         Ok(Self { settings, keys })
     }
 
@@ -182,7 +182,7 @@ mod tests {
             organisation,
             scope_claim: scope_claim.to_owned(),
             scopes,
-            min_refresh: Duration::from_secs(10),
+            ages: Ages::with_min_refresh(std::time::Duration::from_secs(10)),
         })
         .unwrap()
     }

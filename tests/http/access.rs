@@ -217,3 +217,19 @@ async fn refusals_without_end_do_not_fill_the_disk() {
     assert!((60..70).contains(&refused.len()), "{}", refused.len());
     assert!(refused.iter().all(|path| path.chars().count() == 501 && path.ends_with('…')));
 }
+
+#[tokio::test]
+async fn a_key_for_some_plants_finds_them_by_name_and_creates_none() {
+    let mut app = keyed().await;
+    let (_, field) = app.post("/api/v1/plants", json!({"name": "Field"})).await;
+    for name in ["Field 2", "Fiel"] {
+        app.post("/api/v1/plants", json!({"name": name})).await;
+    }
+    let asked = json!({"name": "x", "scopes": ["upload"], "plants": [field["id"]]});
+    let (secret, _) = secret_of(&app, asked).await;
+    app.secret = Some(secret);
+    assert_eq!(app.post("/api/v1/plants", json!({"name": "Field"})).await, (StatusCode::OK, field));
+    for name in ["Field 2", "Fiel", "New"] {
+        assert_problem(app.post("/api/v1/plants", json!({"name": name})).await, 403, "forbidden", "plants");
+    }
+}

@@ -7,7 +7,8 @@ use axum::extract::State;
 use axum::routing::get;
 use base64::Engine;
 use base64::prelude::BASE64_URL_SAFE_NO_PAD;
-use heliomap::oidc::{Oidc, OidcSettings, OrganisationRule};
+use heliomap::oidc::keys::Ages;
+use heliomap::oidc::{Oidc, OidcError, OidcSettings, OrganisationRule};
 use heliomap::store::Scope;
 use reqwest::{Method, StatusCode};
 use ring::rand::SystemRandom;
@@ -15,7 +16,7 @@ use ring::signature::{
     ECDSA_P256_SHA256_FIXED_SIGNING, EcdsaKeyPair, Ed25519KeyPair, KeyPair, RSA_PKCS1_SHA256, RsaKeyPair,
 };
 use serde_json::{Value, json};
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -101,6 +102,8 @@ struct Provider {
     keys: Arc<Mutex<Vec<Value>>>,
     issuer: Arc<Mutex<String>>,
     asked: Arc<AtomicUsize>,
+    /// Whether it takes connections and says nothing.
+    silent: Arc<AtomicBool>,
 }
 
 impl Provider {
@@ -109,6 +112,9 @@ impl Provider {
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
         *provider.issuer.lock().unwrap() = format!("http://{}", listener.local_addr().unwrap());
         let discovery = async |State(provider): State<Self>| {
+            if provider.silent.load(Ordering::Relaxed) {
+                std::future::pending::<()>().await;
+            }
             let issuer = provider.issuer();
             axum::Json(json!({"issuer": issuer, "jwks_uri": format!("{issuer}/keys"), "response_types_supported": []}))
         };
@@ -128,6 +134,10 @@ impl Provider {
     }
 
     fn oidc(&self, min_refresh: Duration) -> Oidc {
+        self.oidc_with(Ages::with_min_refresh(min_refresh))
+    }
+
+    fn oidc_with(&self, ages: Ages) -> Oidc {
         let word = |scope: Scope| (format!("heliomap:{scope}"), scope);
         Oidc::new(OidcSettings {
             issuer: self.issuer(),
@@ -135,7 +145,7 @@ impl Provider {
             organisation: OrganisationRule::Claim("organisation".to_owned()),
             scope_claim: "scope".to_owned(),
             scopes: Scope::ALL.into_iter().map(word).collect(),
-            min_refresh,
+            ages,
         })
         .unwrap()
     }
@@ -267,6 +277,31 @@ async fn new_keys_are_fetched_when_they_are_shown_and_not_too_often() {
     tokio::time::sleep(Duration::from_millis(310)).await;
     assert_eq!(oidc.bearer(&new.token("2", &provider.claims())).await.unwrap().subject, "pilot-7");
     assert!(oidc.bearer(&old.token("1", &provider.claims())).await.is_ok());
+}
+
+#[tokio::test]
+async fn a_provider_that_falls_silent_keeps_nobody_waiting_and_its_keys_hold_for_a_while() {
+    let key = Key::ed();
+    let provider = Provider::new(vec![key.jwk("1")]).await;
+    let (claims, wait) = (provider.claims(), Duration::from_secs(2));
+    let old = Ages { min_refresh: Duration::ZERO, fresh: Duration::ZERO, most: Duration::from_secs(3600) };
+    let oidc = provider.oidc_with(old);
+    assert!(oidc.bearer(&key.token("1", &claims)).await.is_ok());
+    provider.silent.store(true, Ordering::Relaxed);
+    for _ in 0..20 {
+        let answer = tokio::time::timeout(wait, oidc.bearer(&key.token("1", &claims))).await;
+        assert!(answer.expect("nobody waits for the provider").is_ok());
+    }
+
+    provider.silent.store(false, Ordering::Relaxed);
+    let most = Duration::from_secs(1);
+    let oidc = provider.oidc_with(Ages { most, ..old });
+    assert!(oidc.bearer(&key.token("1", &claims)).await.is_ok());
+    *provider.issuer.lock().unwrap() = "http://127.0.0.1:9".to_owned();
+    assert!(oidc.bearer(&key.token("1", &claims)).await.is_ok());
+    tokio::time::sleep(most).await;
+    let error = oidc.bearer(&key.token("1", &claims)).await.unwrap_err();
+    assert!(matches!(error, OidcError::Unavailable(_)), "{error}");
 }
 
 #[tokio::test]
