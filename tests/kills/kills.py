@@ -3,12 +3,16 @@
 
 One service without a worker and one worker run on one store. While clients upload the example survey and follow its
 job, one of the two is killed (SIGKILL) every now and then and started again at once. Every other kill is aimed at a stage of
-the mapping, in turn: it comes within a moment after the worker's log says that the stage begins. Each photo's name holds the next
-photo's bytes first, so that bytes that nothing names are deleted just when they come again. Afterwards:
+the mapping, in turn: it comes after the worker's log says that the stage begins, before it ends where it takes as long as
+without kills. Each photo's name holds the next photo's bytes first, so that bytes that nothing names are deleted just when they
+come again. After each survey, and again for all of them at the end:
 
 - every file whose upload was acknowledged is in its survey, and its bytes have the digest that was acknowledged;
-- every job has ended once, and made one model;
-- the models are what a run without kills makes, to the last digit (identifiers apart, which differ by plant).
+- every job has ended once, and made one model; what it was when it ended it still is at the end;
+- the models are what a run without kills makes, to the last digit (identifiers apart, which differ by plant);
+- a webhook was told of each job's end by one message (the same one may come twice), which says how the job ended.
+
+With `--kills` of 100 and more, every stage must have been hit: by a kill of the worker, where its log ends within that stage.
 
 Only Python's standard library is used. The last line gives the figures; the exit code is 1 where something does not hold.
 """
@@ -30,13 +34,19 @@ import threading
 import time
 import urllib.error
 import urllib.request
+from collections import Counter
+from datetime import datetime
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 EXAMPLE = ROOT / "examples" / "plant"
-#: What kills are aimed at, by what the worker logs at its beginning. Layouts are made while others are detected in.
-STAGES = {stage: f'"stage":"{stage}"' for stage in ("read", "detect", "locate", "fuse", "refine", "assemble")}
-STAGES["store"] = "storing the model begins"
+#: What kills are aimed at. Layouts are made while others are detected in.
+STAGES = ("read", "detect", "locate", "fuse", "refine", "assemble", "store")
+#: So many kills must hit every stage, upload and queue included.
+MANY = 100
+#: A stage that takes longer is not killed later than this after its beginning by a kill that is aimed at it.
+LATEST_S = 0.5
 FINAL = ("succeeded", "failed", "cancelled")
 #: What the network throws at a client whose server dies.
 LOST = (urllib.error.URLError, ConnectionError, http.client.HTTPException, TimeoutError)
@@ -47,24 +57,51 @@ def log(text: str) -> None:
 
 
 class Process:
-    """A program that is started again when it is killed."""
+    """A program that is started again when it is killed, and what its log says it is doing."""
 
     def __init__(self, name: str, command: list[str], folder: Path):
         self.name, self.command = name, command
         self.log = open(folder / f"{name}.log", "ab")
         self.read = open(folder / f"{name}.log", "r", errors="replace")
+        self.rest = ""
         self.child: subprocess.Popen | None = None
+        #: The stages that it began since it was started, with the times; the last is `None` where it has no job.
+        self.stages: list[tuple[str | None, float]] = []
 
     def start(self) -> None:
+        self.look()
+        self.stages = [(None, 0.0)]
         self.child = subprocess.Popen(self.command, stdout=self.log, stderr=self.log)
 
-    def said_nothing_yet(self) -> None:
-        """What it has said so far does not count."""
-        self.read.seek(0, os.SEEK_END)
+    def look(self) -> list[str | None]:
+        """Reads on in the log; the stages that it says have begun, `None` for the end of a job."""
+        *lines, self.rest = (self.rest + self.read.read()).split("\n")
+        known = len(self.stages)
+        for line in lines:
+            if line.startswith("{"):
+                event = json.loads(line)
+                message = event["message"]
+                at = datetime.fromisoformat(event["timestamp"]).timestamp()
+                if message == "job started":
+                    self.stages.append(("start", at))
+                elif message == "stage begins":
+                    self.stages.append((event["stage"], at))
+                elif message == "storing the model begins":
+                    self.stages.append(("store", at))
+                elif message == "job left":
+                    self.stages.append((None, at))
+        return [stage for stage, _ in self.stages[known:]]
 
-    def says(self, what: str) -> bool:
-        """Whether it has said something since the last time."""
-        return what in self.read.read()
+    def stage(self) -> str | None:
+        """What it does now, or did when it was killed."""
+        self.look()
+        return self.stages[-1][0]
+
+    def lengths(self) -> dict[str, float]:
+        """How long the stages of its first job took."""
+        self.look()
+        spans = zip(self.stages, self.stages[1:])
+        return {stage: end - begun for (stage, begun), (_, end) in reversed([*spans]) if stage}
 
     def kill(self) -> None:
         self.child.send_signal(signal.SIGKILL)
@@ -77,6 +114,27 @@ class Process:
                 self.child.wait(timeout=60)
             except subprocess.TimeoutExpired:
                 self.child.kill()
+
+
+class Receiver:
+    """Takes the messages to a webhook."""
+
+    def __init__(self):
+        self.messages: list[dict] = []
+        messages = self.messages
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_POST(self) -> None:
+                messages.append(json.loads(self.rfile.read(int(self.headers["content-length"]))))
+                self.send_response(204)
+                self.end_headers()
+
+            def log_message(self, *_: object) -> None:
+                pass
+
+        server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        self.url = f"http://127.0.0.1:{server.server_port}/"
 
 
 class Api:
@@ -109,6 +167,15 @@ class Api:
     def post(self, path: str, value: dict) -> dict:
         return self.call("POST", path, json.dumps(value).encode(), "application/json")
 
+    def all(self, path: str) -> list[dict]:
+        """A list to its end."""
+        part = self.call("GET", path)
+        items = part["items"]
+        while part.get("next"):
+            part = self.call("GET", part["next"].removeprefix("/api/v1"))
+            items += part["items"]
+        return items
+
 
 def survey_files() -> dict[str, Path]:
     """The example's files by their place in the API's survey."""
@@ -125,6 +192,7 @@ class Round:
         self.api, self.name = api, name
         self.phase = "create"
         self.acknowledged: dict[str, str] = {}
+        self.job: dict | None = None
 
     def run(self) -> None:
         self.plant = self.api.post("/plants", {"name": self.name})["id"]
@@ -175,6 +243,8 @@ class Round:
         jobs = self.api.call("GET", f"{here}/jobs")["items"]
         if len(jobs) != 1:
             wrongs.append(f"the survey has {len(jobs)} jobs")
+        elif jobs[0] != self.job:
+            wrongs.append(f"the job ended as {self.job} and is {jobs[0]} now")
         if self.job["state"] != "succeeded":
             return wrongs + [f"the job {self.job['state']}: {self.job.get('error')}"]
         if len(self.api.call("GET", f"/plants/{self.plant}/models")["items"]) != 1:
@@ -183,6 +253,25 @@ class Round:
             if text != expected[layer]:
                 wrongs.append(f"the {layer} are not those of a run without kills")
         return wrongs
+
+
+def told_wrongs(api: Api, hook: str, receiver: Receiver, rounds: list[Round]) -> list[str]:
+    """What does not hold of the messages about these jobs' ends; waits for those that are still to be sent."""
+    # Whoever died while it sent one has it for a minute.
+    end = time.monotonic() + 120
+    while any(told["state"] == "waiting" for told in api.all(f"{hook}/deliveries")) and time.monotonic() < end:
+        time.sleep(0.5)
+    wrongs = []
+    kept = api.all(f"{hook}/deliveries")
+    for one in rounds:
+        job, state = one.job["id"], one.job["state"]
+        rows = [told for told in kept if told["job"] == job]
+        events = {(told["id"], told["event"]) for told in receiver.messages if told["job"] == job}
+        if [told["state"] for told in rows] != ["delivered"]:
+            wrongs.append(f"{one.name}: the messages about the job's end are {rows}")
+        elif events != {(rows[0]["id"], f"job.{state}")}:
+            wrongs.append(f"{one.name}: the job {state}, and what came of it is {sorted(events)}")
+    return wrongs
 
 
 def free_port() -> int:
@@ -207,18 +296,22 @@ def main() -> int:
     store = ["--data-dir", str(data), "--keep-replaced", "0.1"] + (["--database", args.database] if args.database else [])
     # Every kill counts as an attempt: the limit must not end a job here.
     lives = ["--max-attempts", str(1000 + args.kills)]
+    hooks = ["--webhook-private-targets"]
     server = Process("server", [str(args.binary), "serve", "--insecure", "--no-worker", "--listen",
-                                f"127.0.0.1:{port}", *store, *lives], folder)
+                                f"127.0.0.1:{port}", *store, *lives, *hooks], folder)
     worker = Process("worker", [str(args.binary), "worker", "--lease", "2", "--detector",
-                                str(ROOT / "models" / "unet.onnx"), *store], folder)
+                                str(ROOT / "models" / "unet.onnx"), *store, *hooks], folder)
     api = Api(f"http://127.0.0.1:{port}/api/v1")
-    kills: dict[str, int] = {}
+    receiver = Receiver()
+    kills: Counter[tuple[str, str]] = Counter()
     failures: list[str] = []
+    ended: list[Round] = []
     rounds = 0
     begun = time.monotonic()
     try:
         server.start()
         worker.start()
+        hook = f"/webhooks/{api.post('/webhooks', {'url': receiver.url})['id']}"
         quiet = Round(api, "quiet")
         start = time.monotonic()
         quiet.run()
@@ -226,6 +319,8 @@ def main() -> int:
         if quiet.job["state"] != "succeeded":
             raise SystemExit(f"the run without kills {quiet.job['state']}: {quiet.job.get('error')}")
         expected = quiet.model()
+        ended.append(quiet)
+        lengths = worker.lengths()
         log(f"without kills: {quiet_s:.1f} s from the first byte to the model, {len(expected['modules'])} bytes of modules")
         while sum(kills.values()) < args.kills:
             rounds += 1
@@ -244,24 +339,34 @@ def main() -> int:
                 number = sum(kills.values())
                 aim = aims[number // 2 % len(aims)] if number % 2 else None
                 if aim:
-                    worker.said_nothing_yet()
-                    while client.is_alive() and not worker.says(STAGES[aim]):
-                        time.sleep(0.002)
-                    time.sleep(chance.uniform(0, 0.02))
+                    worker.look()
+                    while client.is_alive() and aim not in worker.look():
+                        time.sleep(0.001)
+                    time.sleep(chance.uniform(0, min(lengths[aim], LATEST_S)))
                 else:
                     client.join(chance.uniform(0.02, quiet_s / 2))
                 if not client.is_alive() or number >= args.kills:
                     client.join()
                     break
                 victim = server if chance.random() < (0.2 if aim else 0.4) else worker
-                key = f"{victim.name} in {aim or current.phase}"
-                kills[key] = kills.get(key, 0) + 1
+                phase = current.phase if current.phase in ("create", "upload") else "queue"
                 victim.kill()
+                kills[victim.name, worker.stage() or phase] += 1
                 victim.start()
             wrongs = [str(failed[0])] if failed else current.wrongs(data, expected)
             failures += [f"round {rounds}: {wrong}" for wrong in wrongs]
+            if not failed:
+                ended.append(current)
             state = "failed" if failed else f"{current.job['state']} at attempt {current.job['attempt']}"
             log(f"round {rounds}: {sum(kills.values())} kills so far, job {state}" + "".join(f"\n  WRONG: {w}" for w in wrongs))
+        last = [f"{one.name}: {wrong}" for one in ended for wrong in one.wrongs(data, expected)]
+        last += told_wrongs(api, hook, receiver, ended)
+        if args.kills >= MANY:
+            hit = {stage for name, stage in kills if name == "worker" or stage not in STAGES}
+            last += [f"no kill came in {stage}" for stage in ("upload", "queue", *STAGES) if stage not in hit]
+        failures += last
+        log(f"at the end: {len(ended)} jobs, {len(receiver.messages)} messages, {len({m['id'] for m in receiver.messages})} of them "
+            "different" + "".join(f"\n  WRONG: {wrong}" for wrong in last))
     finally:
         worker.stop()
         server.stop()
@@ -269,8 +374,8 @@ def main() -> int:
             log(f"logs: {folder}")
         else:
             shutil.rmtree(folder, ignore_errors=True)
-    for key in sorted(kills):
-        log(f"  killed {key}: {kills[key]}")
+    for stage in dict.fromkeys(["create", "upload", "queue", "start", *STAGES, *(stage for _, stage in kills)]):
+        log(f"  killed in {stage}: worker {kills['worker', stage]}, server {kills['server', stage]}")
     log(f"{sum(kills.values())} kills in {rounds} surveys, {api.repeated} requests repeated, "
         f"{time.monotonic() - begun:.0f} s: {len(failures)} wrong")
     return 1 if failures else 0
