@@ -2,17 +2,18 @@
 """Kills server and worker at random while surveys are uploaded and mapped, and checks that nothing is lost.
 
 One service without a worker and one worker run on one store. While clients upload the example survey and follow its
-job, one of the two is killed (SIGKILL) every now and then and started again at once. Every other kill is aimed at a stage of
-the mapping, in turn: it comes after the worker's log says that the stage begins, before it ends where it takes as long as
-without kills. Each photo's name holds the next photo's bytes first, so that bytes that nothing names are deleted just when they
-come again. After each survey, and again for all of them at the end:
+job, one of the two is killed (SIGKILL) every now and then and started again at once. Every other kill is aimed at a stage
+of the mapping, in turn: it comes after the worker's log says that the stage begins, before it ends where it takes as long
+as without kills. Each photo's name holds the next photo's bytes first, so that bytes that nothing names are deleted just
+when they come again. After each survey, and again for all of them at the end:
 
 - every file whose upload was acknowledged is in its survey, and its bytes have the digest that was acknowledged;
 - every job has ended once, and made one model; what it was when it ended it still is at the end;
 - the models are what a run without kills makes, to the last digit (identifiers apart, which differ by plant);
 - a webhook was told of each job's end by one message (the same one may come twice), which says how the job ended.
 
-With `--kills` of 100 and more, every stage must have been hit: by a kill of the worker, where its log ends within that stage.
+With `--kills` of 100 and more, every stage must have been hit: by a kill of the worker after which its log ends within
+that stage.
 
 Only Python's standard library is used. The last line gives the figures; the exit code is 1 where something does not hold.
 """
@@ -365,8 +366,9 @@ def main() -> int:
             hit = {stage for name, stage in kills if name == "worker" or stage not in STAGES}
             last += [f"no kill came in {stage}" for stage in ("upload", "queue", *STAGES) if stage not in hit]
         failures += last
-        log(f"at the end: {len(ended)} jobs, {len(receiver.messages)} messages, {len({m['id'] for m in receiver.messages})} of them "
-            "different" + "".join(f"\n  WRONG: {wrong}" for wrong in last))
+        different = len({message["id"] for message in receiver.messages})
+        log(f"at the end: {len(ended)} jobs, {len(receiver.messages)} messages, {different} of them different"
+            + "".join(f"\n  WRONG: {wrong}" for wrong in last))
     finally:
         worker.stop()
         server.stop()
