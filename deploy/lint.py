@@ -34,9 +34,15 @@ VALUES = {
         "worker": {"nodeSelector": {"gpu": "no"}, "tolerations": [{"operator": "Exists"}], "affinity": {"nodeAffinity": {}}},
     },
     "roles in place of keys": {"blobs": {"existingSecret": ""}, "metrics": {"scrapeAnnotations": False}},
+    "a gateway in front": {"server": {"behindProxy": True}},
+    "an ingress that hides nobody": {"ingress": {"enabled": True}, "server": {"behindProxy": False}},
+    "a proxy by the environment": {"env": {"HELIOMAP_BEHIND_PROXY": "true"}},
 }
+#: Those in which servers take clients' addresses from a proxy.
+BEHIND_PROXY = ("everything on", "a gateway in front", "a proxy by the environment")
 #: Values that the chart's schema refuses.
-REFUSED = ({"blobs": {"url": "https://bucket"}}, {"database": {"existingSecret": ""}}, {"server": {"replicas": 0}}, {"typo": 1})
+REFUSED = ({"blobs": {"url": "https://bucket"}}, {"database": {"existingSecret": ""}}, {"server": {"replicas": 0}}, {"typo": 1},
+           {"server": {"behindProxy": "yes"}})
 
 
 def merged(base: dict, more: dict) -> dict:
@@ -67,7 +73,14 @@ def secure(name: str, pod: dict) -> list[str]:
         for variable in container["env"]:
             if re.search("DATABASE|KEY|SECRET|PASSWORD", variable["name"]) and "valueFrom" not in variable:
                 wrongs.append(f"{name} has {variable['name']} in the clear")
+        names = [variable["name"] for variable in container["env"]]
+        wrongs += [f"{name} has {variable} more than once" for variable in set(names) if names.count(variable) > 1]
     return wrongs
+
+
+def behind_proxy(pod: dict) -> bool:
+    """Whether a server takes clients' addresses from a proxy."""
+    return {"name": "HELIOMAP_BEHIND_PROXY", "value": "true"} in pod["containers"][0]["env"]
 
 
 def check_chart() -> list[str]:
@@ -101,6 +114,8 @@ def check_chart() -> list[str]:
                             wrongs.append(f"{title}, {kind} {name}, Kubernetes {version}: {error}")
                     if kind in ("Deployment", "StatefulSet"):
                         wrongs += secure(f"{title}, {kind} {name}:", document["spec"]["template"]["spec"])
+                    if kind == "StatefulSet" and behind_proxy(document["spec"]["template"]["spec"]) != (title in BEHIND_PROXY):
+                        wrongs.append(f"{title}, {kind} {name}: clients' addresses are taken from the wrong place")
         for values in REFUSED:
             try:
                 chart.validate_schema(merged(defaults, values))

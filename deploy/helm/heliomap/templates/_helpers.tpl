@@ -68,10 +68,15 @@ capabilities:
       key: {{ . }}
 {{- end }}
 {{- end }}
-{{- range $name, $value := merge (dict) .own $values.env }}
+{{- range $name, $value := merge (dict) .own $values.env (.defaults | default dict) }}
 - name: {{ $name }}
   value: {{ $value | quote }}
 {{- end }}
+{{- end }}
+
+{{/* What servers alone are told: that clients' addresses are what a proxy says. */}}
+{{- define "heliomap.behindProxy" -}}
+{{- if kindIs "bool" .Values.server.behindProxy }}{{ .Values.server.behindProxy }}{{ else }}{{ .Values.ingress.enabled }}{{ end }}
 {{- end }}
 
 {{- define "heliomap.image" -}}
