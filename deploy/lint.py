@@ -34,12 +34,16 @@ VALUES = {
         "worker": {"nodeSelector": {"gpu": "no"}, "tolerations": [{"operator": "Exists"}], "affinity": {"nodeAffinity": {}}},
     },
     "roles in place of keys": {"blobs": {"existingSecret": ""}, "metrics": {"scrapeAnnotations": False}},
+    "a Prometheus with labels of its own": {"autoscaling": {"enabled": True, "matchers": 'app="demo"'}},
     "a gateway in front": {"server": {"behindProxy": True}},
     "an ingress that hides nobody": {"ingress": {"enabled": True}, "server": {"behindProxy": False}},
     "a proxy by the environment": {"env": {"HELIOMAP_BEHIND_PROXY": "true"}},
 }
 #: Those in which servers take clients' addresses from a proxy.
 BEHIND_PROXY = ("everything on", "a gateway in front", "a proxy by the environment")
+#: Pods of the release that is rendered here, and of others in its namespace.
+OWN_PODS = ("demo-heliomap-server-0", "demo-heliomap-server-12", "demo-heliomap-worker-7c9f8d6b5-x2x4z")
+OTHER_PODS = ("heliomap-server-0", "other-demo-heliomap-server-0", "demo-heliomap-worker-b-server-0", "demo-heliomap-2-server-0")
 #: Values that the chart's schema refuses.
 REFUSED = ({"blobs": {"url": "https://bucket"}}, {"database": {"existingSecret": ""}}, {"server": {"replicas": 0}}, {"typo": 1},
            {"server": {"behindProxy": "yes"}})
@@ -78,6 +82,22 @@ def secure(name: str, pod: dict) -> list[str]:
     return wrongs
 
 
+def scope(title: str, query: str) -> list[str]:
+    """Where KEDA's query counts what other releases' pods say, or misses what this one's say."""
+    if query.count("(") != query.count(")") or len(re.findall(r"heliomap_\w+", query)) != 3:
+        return [f"{title}: the query is not the one that is checked here: {query}"]
+    wrongs = []
+    for metric in re.findall(r"heliomap_\w+", query):
+        matchers = re.search(rf"{metric}{{([^}}]*)}}", query)
+        labels = dict(re.findall(r'(\w+)=~?"([^"]*)"', matchers[1] if matchers else ""))
+        if labels.get("app") == "demo":
+            continue
+        pods = {pod: bool(re.fullmatch(labels.get("pod", ".*"), pod)) for pod in (*OWN_PODS, *OTHER_PODS)}
+        if labels.get("namespace") != "heliomap" or any(found != (pod in OWN_PODS) for pod, found in pods.items()):
+            wrongs.append(f"{title}: {metric} counts the wrong pods: {labels}")
+    return wrongs
+
+
 def behind_proxy(pod: dict) -> bool:
     """Whether a server takes clients' addresses from a proxy."""
     return {"name": "HELIOMAP_BEHIND_PROXY", "value": "true"} in pod["containers"][0]["env"]
@@ -105,6 +125,8 @@ def check_chart() -> list[str]:
                         continue
                     kind, name = document["kind"], document["metadata"]["name"]
                     kinds.add(kind)
+                    if kind == "ScaledObject":
+                        wrongs += scope(title, document["spec"]["triggers"][0]["metadata"]["query"])
                     if document["apiVersion"].startswith("keda.sh/"):
                         continue
                     for version in KUBERNETES:

@@ -74,6 +74,13 @@ capabilities:
 {{- end }}
 {{- end }}
 
+{{/* The label matchers by which Prometheus tells what this release's pods say from what others say. */}}
+{{- define "heliomap.pods" -}}
+{{- $name := include "heliomap.name" . -}}
+{{- $pods := printf "namespace=\"%s\",pod=~\"%s-(server-[0-9]+|worker-[0-9a-z]+-[0-9a-z]+)\"" .Release.Namespace $name -}}
+{{ .Values.autoscaling.matchers | default $pods }}
+{{- end }}
+
 {{/* What servers alone are told: that clients' addresses are what a proxy says. */}}
 {{- define "heliomap.behindProxy" -}}
 {{- if kindIs "bool" .Values.server.behindProxy }}{{ .Values.server.behindProxy }}{{ else }}{{ .Values.ingress.enabled }}{{ end }}
