@@ -230,12 +230,15 @@ pub struct Problem {
     /// A URN that ends in the code.
     #[schema(example = "urn:heliomap:problem:plant_not_found")]
     pub r#type: String,
+    #[schema(example = "There is no such plant")]
     pub title: String,
+    #[schema(example = 404)]
     pub status: u16,
     /// A stable word to tell problems apart by.
     #[schema(example = "plant_not_found")]
     pub code: String,
     /// What does not work and what to do, for people.
+    #[schema(example = "no plant has the identifier 0b7a3f7e-59b1-4f0c-9f0d-3d6f3d1f7a11")]
     pub detail: String,
 }
 
@@ -286,7 +289,7 @@ pub fn describe(description: &mut OpenApi) {
     }
 }
 
-fn operations(item: &mut PathItem) -> impl Iterator<Item = (&'static str, &mut Operation)> {
+pub(super) fn operations(item: &mut PathItem) -> impl Iterator<Item = (&'static str, &mut Operation)> {
     let PathItem { get, put, post, delete, patch, head, .. } = item;
     [("get", get), ("put", put), ("post", post), ("delete", delete), ("patch", patch), ("head", head)]
         .into_iter()
@@ -294,7 +297,7 @@ fn operations(item: &mut PathItem) -> impl Iterator<Item = (&'static str, &mut O
 }
 
 /// The codes that a text names in backticks.
-fn named(text: &str) -> BTreeSet<Code> {
+pub(super) fn named(text: &str) -> BTreeSet<Code> {
     let words: BTreeSet<&str> = text.split('`').skip(1).step_by(2).collect();
     Code::ALL.iter().copied().filter(|code| words.contains(code.parts().1)).collect()
 }

@@ -261,18 +261,25 @@ enum LayerName {
 #[expect(dead_code, reason = "it describes what is written from stored text")]
 struct FeatureCollection {
     /// `FeatureCollection`
+    #[schema(example = "FeatureCollection")]
     r#type: String,
     /// The plant's name.
+    #[schema(example = "Sunfield")]
     name: String,
     plant: Uuid,
+    #[schema(example = "modules")]
     layer: String,
     model_version: u32,
     /// The survey that the model was mapped from.
+    #[schema(example = "5c1f4a9e-1a54-4d0e-8d6e-54d3a9be7a77")]
     survey: String,
     /// What the coordinates are and where the local frame's origin is.
+    #[schema(example = json!({"crs": "EPSG:4979"}))]
     reference_frame: Value,
     /// What heights refer to.
+    #[schema(example = "height above the WGS84 ellipsoid")]
     vertical_datum: String,
+    #[schema(example = json!([]))]
     warnings: Vec<Value>,
     /// With `limit`: how many features these are.
     #[schema(required = false, rename = "numberReturned")]
@@ -288,12 +295,15 @@ struct FeatureCollection {
 #[expect(dead_code, reason = "it describes what is written from stored text")]
 struct GeoFeature {
     /// `Feature`
+    #[schema(example = "Feature")]
     r#type: String,
     /// The global identifier.
     id: Uuid,
     /// A polygon; positions are longitude, latitude and height.
+    #[schema(example = json!({"type": "Polygon", "coordinates": [[[8.0, 50.0, 101.2], [8.00001, 50.0, 101.2], [8.00001, 50.00002, 102.0], [8.0, 50.00002, 102.0], [8.0, 50.0, 101.2]]]}))]
     geometry: Value,
     /// `id`, `label`, `plant`, the place in the plant (`line`, `bench`, `sector`, `row`, `number`), and what was measured:
     /// `center`, `tilt_deg`, `azimuth_deg`, `width_m`, `height_m`, `views`, `images`, `status`.
+    #[schema(example = json!({"label": "L01-B02-R1-007", "row": 1, "number": 7, "tilt_deg": 25.0, "azimuth_deg": 180.0}))]
     properties: Value,
 }

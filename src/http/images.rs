@@ -29,11 +29,16 @@ pub struct FileView {
     #[schema(example = "images/DJI_0001.jpg")]
     pub path: String,
     /// `image` or `reconstruction`.
+    #[schema(example = "image")]
     pub kind: &'static str,
     /// Bytes.
     pub size: u64,
     /// SHA-256 of its bytes, hexadecimal.
-    #[schema(min_length = 64, max_length = 64)]
+    #[schema(
+        example = "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08",
+        min_length = 64,
+        max_length = 64
+    )]
     pub sha256: String,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub width_px: Option<u32>,
@@ -121,6 +126,7 @@ pub struct PhotoWarning {
     #[schema(example = "blurred")]
     pub code: &'static str,
     /// What is wrong and what to do.
+    #[schema(example = "the photo is blurred")]
     pub message: String,
 }
 
@@ -382,6 +388,7 @@ fn feature(image: &ImageView) -> Option<serde_json::Value> {
 #[expect(dead_code, reason = "it describes what is written as JSON")]
 struct ImagePositions {
     /// `FeatureCollection`
+    #[schema(example = "FeatureCollection")]
     r#type: String,
     survey: uuid::Uuid,
     features: Vec<ImagePosition>,
@@ -392,12 +399,16 @@ struct ImagePositions {
 #[expect(dead_code, reason = "it describes what is written as JSON")]
 struct ImagePosition {
     /// `Feature`
+    #[schema(example = "Feature")]
     r#type: String,
     /// The photo's file name.
+    #[schema(example = "DJI_0001.jpg")]
     id: String,
     /// A point: longitude, latitude and, where there is one, height.
+    #[schema(example = json!({"type": "Point", "coordinates": [8.0, 50.0, 140.0]}))]
     geometry: serde_json::Value,
     /// `name`, `camera`, `taken`, `reconstructed` (null where there is no reconstruction yet) and `warnings` (codes).
+    #[schema(example = json!({"name": "DJI_0001.jpg", "reconstructed": true, "warnings": []}))]
     properties: serde_json::Value,
 }
 
@@ -414,9 +425,11 @@ pub struct ImagesSummary {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reconstructed: Option<usize>,
     /// Photos that were uploaded and from which the reconstruction was not made, the first 1,000 of them.
+    #[schema(example = json!(["DJI_0007.jpg"]))]
     pub not_reconstructed: Vec<String>,
     pub not_reconstructed_count: usize,
     /// Images from which the reconstruction was made and that were not uploaded, the first 1,000 of them.
+    #[schema(example = json!([]))]
     pub not_uploaded: Vec<String>,
     pub not_uploaded_count: usize,
 }

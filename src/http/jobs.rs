@@ -113,6 +113,7 @@ pub struct JobView {
     pub options: serde_json::Value,
     /// Where its model is, once it has succeeded.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(example = "/api/v1/plants/0b7a3f7e-59b1-4f0c-9f0d-3d6f3d1f7a11/models/1")]
     pub model: Option<String>,
     /// The version of its model.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -150,8 +151,10 @@ pub struct ProgressView {
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 pub struct JobErrorView {
     /// A stable word.
+    #[schema(example = "no_modules")]
     pub code: String,
     /// What is wrong and what to do.
+    #[schema(example = "no module was found in any of 12 images")]
     pub message: String,
 }
 
@@ -159,10 +162,13 @@ pub struct JobErrorView {
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 pub struct WarningView {
     /// A stable word.
+    #[schema(example = "images_supplementary")]
     pub code: String,
     /// One sentence with the place in it.
+    #[schema(example = "2 of 12 images are too coarse to resolve modules")]
     pub message: String,
     /// Images concerned, sorted.
+    #[schema(example = json!(["DJI_0001.jpg"]))]
     pub images: Vec<String>,
     /// Benches concerned, by their identifiers; what was left out of the model has none.
     #[schema(value_type = Vec<Uuid>)]

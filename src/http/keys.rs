@@ -54,6 +54,7 @@ pub struct RotateKey {
 pub struct KeyView {
     #[schema(value_type = Uuid)]
     pub id: KeyId,
+    #[schema(example = "flight")]
     pub name: String,
     /// How its secret begins.
     #[schema(example = "hm_1f0c93ab")]
@@ -82,6 +83,7 @@ pub struct KeyView {
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 pub struct KeyWithSecret {
     /// What clients send as `authorization: Bearer …`.
+    #[schema(example = "helio_shown-this-once-only")]
     pub secret: String,
     #[serde(flatten)]
     pub key: KeyView,
@@ -342,17 +344,21 @@ pub struct AuditView {
     pub key: Option<KeyId>,
     /// What that key is called.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(example = "flight")]
     pub key_name: Option<String>,
     /// Whose token it was done with: the claim `sub` of the identity provider.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(example = "pilot-7")]
     pub subject: Option<String>,
     #[schema(example = "DELETE")]
     pub method: String,
+    #[schema(example = "/api/v1/plants")]
     pub path: String,
     /// The status of the answer.
     #[schema(example = 204)]
     pub status: u16,
     /// The request's `x-request-id`.
+    #[schema(example = "01a1a0e5-6f2f-4a52-9f0e-8a3a9b1a6a10")]
     pub request_id: String,
 }
 

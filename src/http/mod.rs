@@ -9,6 +9,7 @@ mod conditional;
 mod docs;
 mod encoding;
 mod events;
+mod examples;
 mod extract;
 mod features;
 mod file_lists;

@@ -56,6 +56,7 @@ pub struct ModelDetail {
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 pub struct LayerView {
     /// `modules`, `sectors`, `benches` or `lines`.
+    #[schema(example = "modules")]
     pub layer: &'static str,
     /// How many features it holds.
     pub features: u64,
@@ -64,6 +65,7 @@ pub struct LayerView {
     #[schema(value_type = Option<Vec<f64>>, min_items = 4, max_items = 4)]
     pub bbox: Option<[f64; 4]>,
     /// Where its GeoJSON is.
+    #[schema(example = "/api/v1/plants/0b7a3f7e-59b1-4f0c-9f0d-3d6f3d1f7a11/models/1/modules")]
     pub href: String,
 }
 

@@ -152,6 +152,7 @@ pub struct List<T> {
     pub items: Vec<T>,
     /// The next part, where there is one; also in the header `link`.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(example = "/api/v1/plants?limit=100&cursor=100")]
     pub next: Option<String>,
 }
 

@@ -29,6 +29,7 @@ pub struct NewPlant {
 pub struct PlantView {
     #[schema(value_type = Uuid)]
     pub id: PlantId,
+    #[schema(example = "Sunfield")]
     pub name: String,
     #[schema(value_type = String, format = DateTime)]
     pub created: Timestamp,

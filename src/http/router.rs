@@ -2,8 +2,8 @@
 
 use super::guard::{Gate, Policy};
 use super::{
-    AppState, admission, conditional, docs, encoding, error, events, features, guard, health, idempotency, images,
-    jobs, keys, loopback, models, page, plants, surveys, tus, uploads, usage, webhooks,
+    AppState, admission, conditional, docs, encoding, error, events, examples, features, guard, health, idempotency,
+    images, jobs, keys, loopback, models, page, plants, surveys, tus, uploads, usage, webhooks,
 };
 use crate::config::NetworkArgs;
 use crate::telemetry::metrics::RequestLabels;
@@ -111,6 +111,7 @@ pub fn openapi() -> utoipa::openapi::OpenApi {
     idempotency::describe(&mut description);
     conditional::describe(&mut description);
     error::describe(&mut description);
+    examples::describe(&mut description);
     description
 }
 

@@ -32,6 +32,7 @@ pub struct SurveyView {
     pub id: SurveyId,
     #[schema(value_type = Uuid)]
     pub plant: PlantId,
+    #[schema(example = "June 2026")]
     pub name: String,
     #[schema(value_type = String, format = DateTime)]
     pub created: Timestamp,
@@ -58,6 +59,9 @@ pub struct SurveyDetail {
     pub files: Vec<FileView>,
     /// The next part of the files, where there is one; also in the header `link`.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(
+        example = "/api/v1/plants/0b7a3f7e-59b1-4f0c-9f0d-3d6f3d1f7a11/surveys/5c1f4a9e-1a54-4d0e-8d6e-54d3a9be7a77?limit=100&cursor=aW1hZ2Vz"
+    )]
     pub next: Option<String>,
 }
 
@@ -68,6 +72,7 @@ pub struct MissingView {
     #[schema(example = "no_reconstruction")]
     pub code: &'static str,
     /// What is missing and what to do.
+    #[schema(example = "there is no reconstruction yet")]
     pub message: String,
 }
 

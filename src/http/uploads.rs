@@ -26,6 +26,7 @@ use std::time::Duration;
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 pub struct UploadedFile {
     /// `created`, `replaced`, or `unchanged` where the same bytes were there.
+    #[schema(example = "created")]
     pub result: &'static str,
     #[serde(flatten)]
     pub file: FileView,
@@ -44,6 +45,7 @@ pub struct UploadedArchive {
     /// How many of its entries are no files of a survey; they were left out.
     pub ignored_count: usize,
     /// The first few of them.
+    #[schema(example = json!(["odm_report/report.pdf"]))]
     pub ignored: Vec<String>,
 }
 

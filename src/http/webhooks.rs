@@ -36,6 +36,7 @@ pub struct CreateWebhook {
 pub struct WebhookView {
     #[schema(value_type = Uuid)]
     pub id: WebhookId,
+    #[schema(example = "https://dashboard.example.org/heliomap")]
     pub url: String,
     /// The plant whose jobs it is told of; all where it is left out.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -55,6 +56,7 @@ impl From<Webhook> for WebhookView {
 #[derive(Serialize, utoipa::ToSchema)]
 pub struct WebhookWithSecret {
     /// The key of the HMAC-SHA256 signatures in the header `heliomap-signature`.
+    #[schema(example = "whsec-shown-this-once-only")]
     pub secret: String,
     #[serde(flatten)]
     pub webhook: WebhookView,
@@ -79,6 +81,7 @@ pub struct DeliveryView {
     pub next_attempt: Option<Timestamp>,
     /// Why it did not arrive the last time.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(example = "it answered 502")]
     pub error: Option<String>,
     #[schema(value_type = String, format = DateTime)]
     pub created: Timestamp,

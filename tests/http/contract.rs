@@ -79,6 +79,48 @@ fn every_operation_tells_its_problems_by_their_status() {
     }
 }
 
+#[test]
+fn every_answer_has_an_example_that_is_as_described() {
+    let description = serde_json::to_value(openapi()).unwrap();
+    let mut problems = std::collections::BTreeSet::new();
+    for (path, operations) in description["paths"].as_object().unwrap() {
+        for (method, operation) in operations.as_object().unwrap().iter().filter(|(method, _)| *method != "options") {
+            for (status, response) in operation["responses"].as_object().unwrap() {
+                for (media_type, content) in response["content"].as_object().into_iter().flatten() {
+                    let about = format!("{method} {path} {status}");
+                    let component = content["schema"]["$ref"].as_str().and_then(|schema| schema.rsplit('/').next());
+                    match (media_type.as_str(), component) {
+                        ("application/json" | "application/geo+json", Some(component)) => {
+                            assert!(content["example"].is_object(), "{about}");
+                            validate(&description, component, &content["example"]);
+                        }
+                        ("application/problem+json", Some(component)) => {
+                            let named = content["examples"].as_object().unwrap_or_else(|| panic!("{about}"));
+                            for (code, example) in named {
+                                let example = match example["$ref"].as_str() {
+                                    Some(reference) => &description.pointer(&reference[1..]).unwrap()["value"],
+                                    None => &example["value"],
+                                };
+                                assert_eq!(
+                                    (&example["code"], &example["status"].to_string()),
+                                    (&json!(code), status),
+                                    "{about}"
+                                );
+                                validate(&description, component, example);
+                                problems.insert(code.clone());
+                            }
+                        }
+                        _ => {}
+                    }
+                }
+            }
+        }
+    }
+    let unheard: Vec<_> = description["components"]["examples"].as_object().unwrap().keys().collect();
+    let unheard: Vec<_> = unheard.into_iter().filter(|code| !problems.contains(*code)).collect();
+    assert!(unheard.is_empty(), "no operation names {unheard:?}");
+}
+
 #[tokio::test]
 async fn real_problems_are_as_described() {
     let description = serde_json::to_value(openapi()).unwrap();

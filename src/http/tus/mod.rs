@@ -60,6 +60,9 @@ pub struct UploadView {
     #[schema(value_type = Uuid)]
     pub id: UploadId,
     /// Where its bytes go.
+    #[schema(
+        example = "/api/v1/plants/0b7a3f7e-59b1-4f0c-9f0d-3d6f3d1f7a11/surveys/5c1f4a9e-1a54-4d0e-8d6e-54d3a9be7a77/uploads/7d3c6f5b-2c7f-4f53-9a0c-2f5b6f0c9d21"
+    )]
     pub location: String,
     /// The file's place in the survey's folder, or `reconstruction` where it is an archive; left out of a part of a file.
     #[serde(skip_serializing_if = "Option::is_none")]
