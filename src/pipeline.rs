@@ -10,6 +10,8 @@ use crate::reconstruction::{self, Photo, Project, ProjectFolder, Shot};
 use crate::refinement::{self, Refined, RefinementOptions};
 use progress::Clock;
 use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+use std::io::{self, Write};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -104,13 +106,14 @@ pub fn map_folder(
         .zip(&layouts)
         .map(|((shot, detections), layout)| View { shot, detections, layout })
         .collect();
-    let fused = match observer.recall_structure() {
+    let of = digest(&detections, &layouts);
+    let fused = match observer.recall_structure(&of) {
         Some(fused) => fused,
         None => {
             let located = clock.stage(Stage::Locate, || fusion::locate::locate(&views, &cloud))?;
             let fusion_options = FusionOptions { rows_per_bench: options.rows_per_bench, ..FusionOptions::default() };
             let fused = clock.stage(Stage::Fuse, || fusion::fuse(&views, located, &fusion_options))?;
-            observer.structure(&fused);
+            observer.structure(&fused, &of);
             fused
         }
     };
@@ -152,6 +155,28 @@ pub fn map_folder(
     })?;
     let timings = clock.timings;
     Ok(Mapping { model, timings, photos, shots, detections, layouts, fused, refined })
+}
+
+/// Tells what was seen in images from everything else that may be.
+fn digest(detections: &[ImageDetections], layouts: &[Layout]) -> String {
+    let mut hashed = Hashed(Sha256::new());
+    // What hashes takes everything, and these have been written before.
+    let _ = ciborium::into_writer(&(detections, layouts), &mut hashed);
+    hashed.0.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+/// Takes bytes, and keeps their digest alone.
+struct Hashed(Sha256);
+
+impl Write for Hashed {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.0.update(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
 }
 
 /// The photos of a folder as OpenSfM leaves it that [`map_folder`] searches, those too coarse to resolve modules left out,

@@ -10,7 +10,7 @@ use crate::reconstruction::ProjectFolder;
 use crate::store::{Blobs, Claim, Completed, Digest, Ending, FileRecord, Heartbeat, NewModel, Store, StoreError};
 use crate::telemetry::Metrics;
 use crate::telemetry::metrics::OutcomeLabels;
-use jiff::Timestamp;
+use jiff::{SignedDuration, Timestamp};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 use tokio::runtime::Handle;
@@ -42,6 +42,9 @@ impl WorkerSettings {
         }
     }
 }
+
+/// How long a job that this version cannot do waits for another, from its beginning.
+const LONGEST_WAIT: SignedDuration = SignedDuration::from_hours(24);
 
 /// How long a mapping that was told to stop may take before its job ends without it.
 const LINGER: Duration = Duration::from_millis(300);
@@ -187,7 +190,7 @@ impl Worker {
         }
     }
 
-    /// Stores what was found since the last time. What cannot be stored is found again where the job is taken up again.
+    /// Stores what was found since the last time. What cannot be stored now is tried again the next time.
     async fn keep(&self, claim: &Claim, watch: &Watch) {
         let (fingerprint, found) = watch.take_found();
         if found.is_empty() {
@@ -197,7 +200,10 @@ impl Worker {
         match kept.unwrap_or(Err(StoreError::Silent)) {
             Ok(true) => {}
             Ok(false) => watch.stop(Stop::Lost),
-            Err(error) => tracing::warn!(%error, "what was found so far cannot be kept"),
+            Err(error) => {
+                tracing::warn!(%error, "what was found so far cannot be kept now");
+                watch.give_back(found);
+            }
         }
     }
 
@@ -228,7 +234,7 @@ impl Worker {
             tracing::info!(findings = known.len(), "the job goes on where it was");
         }
         let pace = self.store.last_stage_ms().await?;
-        watch.begin(fingerprint.clone(), &known, pace.and_then(|text| serde_json::from_str(&text).ok()));
+        watch.begin(fingerprint.clone(), known, pace.and_then(|text| serde_json::from_str(&text).ok()));
         let folder = JobFolder::lay_out(&self.blobs, job.plant, &files).await?;
         watch.share(Share {
             store: self.store.clone(),
@@ -307,7 +313,7 @@ impl Worker {
             }
             (Err(_), Some(Stop::Cancelled)) => Ending::Cancelled,
             (Err(_), Some(Stop::Shutdown)) => Ending::Released,
-            (Err(error), _) => self.ending(error),
+            (Err(error), _) => self.ending(error, claim.job.created),
         };
         tracing::info!(?ending, "job ends without a model");
         self.count(match &ending {
@@ -328,7 +334,7 @@ impl Worker {
     }
 
     /// What is said of an error, and whether the job is tried again.
-    fn ending(&self, error: AttemptError) -> Ending {
+    fn ending(&self, error: AttemptError, created: Timestamp) -> Ending {
         let retry = |code: &str, message: String| Ending::Retry {
             code: code.to_owned(),
             message,
@@ -350,11 +356,13 @@ impl Worker {
             }
             AttemptError::Options(_) | AttemptError::PreviousModel { .. } => {
                 tracing::warn!(%error, "a worker of another version has to do it");
-                Ending::Declined {
-                    code: "another_version".to_owned(),
-                    message: format!("{error}: the job waits for a worker of the version that wrote that"),
-                    pause: self.settings.backoff,
+                let code = "another_version".to_owned();
+                if created.duration_until(Timestamp::now()) > LONGEST_WAIT {
+                    let message = format!("{error}, and for a day no worker of the version that wrote that was there");
+                    return Ending::Failed { code, message };
                 }
+                let message = format!("{error}: the job waits for a worker of the version that wrote that");
+                Ending::Declined { code, message, pause: self.settings.backoff }
             }
             AttemptError::Map(MapError::Cancelled) | AttemptError::Panicked => {
                 tracing::error!(%error, "the mapping failed");

@@ -65,12 +65,12 @@ pub trait Observer: Sync {
     }
     /// Told of what was found in an image, for a later run to recall.
     fn found(&self, _found: &Found) {}
-    /// The structure that an earlier run of this very mapping fused.
-    fn recall_structure(&self) -> Option<Fused> {
+    /// The structure that an earlier run of this very mapping fused of what was seen, which this is the digest of.
+    fn recall_structure(&self, _of: &str) -> Option<Fused> {
         None
     }
-    /// Told of the structure that was fused, for a later run to recall.
-    fn structure(&self, _fused: &Fused) {}
+    /// Told of the structure that was fused, and the digest of what it was fused of, for a later run to recall.
+    fn structure(&self, _fused: &Fused, _of: &str) {}
     /// Told which images are to be searched, in order, so that others may help. Their paths lie in the mapping's folder.
     fn offer(&self, _images: &[Sought]) {}
     /// What is next about the images that were offered: `left`, never empty, are those that were not given out here and

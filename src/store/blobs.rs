@@ -357,7 +357,10 @@ fn move_into_place(staged: TempPath, target: &Path) -> std::io::Result<()> {
     let mut permissions = std::fs::metadata(&staged)?.permissions();
     permissions.set_readonly(true);
     std::fs::set_permissions(&staged, permissions)?;
+    let name = staged.to_path_buf();
     staged.persist(target).map_err(|error| error.error)?;
+    // Where both are names of one file already, nothing was renamed.
+    let _ = std::fs::remove_file(name);
     std::fs::File::open(folder)?.sync_all()
 }
 

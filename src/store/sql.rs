@@ -398,7 +398,8 @@ macro_rules! queues {
             );
             /// Of the webhooks of organisations that are not in the text `$3`.
             pub const CLAIM_DELIVERY: &str = concat!(
-                "UPDATE deliveries SET attempts = attempts + 1, attempts_left = attempts_left - 1, run_after_ms = $2 \
+                "UPDATE deliveries SET attempts = attempts + 1, run_after_ms = $2, \
+                 attempts_left = CASE WHEN attempts_left > 0 THEN attempts_left - 1 ELSE 0 END \
                  WHERE state = 'waiting' AND run_after_ms <= $1 AND seq = (SELECT candidate.seq \
                  FROM deliveries AS candidate JOIN webhooks ON webhooks.id = candidate.webhook_id \
                  WHERE candidate.state = 'waiting' AND candidate.run_after_ms <= $1 \
@@ -467,12 +468,14 @@ pub const COMPLETE_JOB: &str = "\
     UPDATE jobs SET state = 'succeeded', finished_ms = $3, lease_until_ms = NULL, warnings = $4, model_version = $5, \
     error_code = NULL, error_message = NULL, remaining_ms = NULL, stage_ms = $6 \
     WHERE id = $1 AND fence = $2 AND state = 'running'";
-/// `$3` the state, `$4` code, `$5` message, `$6` the time from which to try again, `$7` the time of the end.
+/// `$3` the state, `$4` code, `$5` message, `$6` the time from which to try again, `$7` the time of the end, `$8` how many
+/// attempts are given back, `$9` the time now. What was cancelled meanwhile does not go back to the queue.
 pub const END_JOB: &str = "\
-    UPDATE jobs SET state = $3, error_code = COALESCE($4, error_code), error_message = COALESCE($5, error_message), \
-    run_after_ms = COALESCE($6, run_after_ms), finished_ms = $7, lease_until_ms = NULL, remaining_ms = NULL, \
-    attempt = attempt - $8 \
-    WHERE id = $1 AND fence = $2 AND state = 'running'";
+    UPDATE jobs SET state = CASE WHEN cancel_requested AND $3 = 'queued' THEN 'cancelled' ELSE $3 END, \
+    error_code = COALESCE($4, error_code), error_message = COALESCE($5, error_message), \
+    run_after_ms = COALESCE($6, run_after_ms), lease_until_ms = NULL, remaining_ms = NULL, attempt = attempt - $8, \
+    finished_ms = CASE WHEN cancel_requested AND $3 = 'queued' THEN $9 ELSE $7 END \
+    WHERE id = $1 AND fence = $2 AND state = 'running' RETURNING finished_ms";
 
 pub const INSERT_MODEL: &str = concat!(
     "INSERT INTO models (plant_id, version, survey_id, job_id, sha256, size, warnings, created_ms) \

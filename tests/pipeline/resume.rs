@@ -13,7 +13,7 @@ use uuid::Uuid;
 #[derive(Default)]
 struct Kept {
     images: HashMap<String, Vec<u8>>,
-    structure: Option<Vec<u8>>,
+    structure: Option<(String, Vec<u8>)>,
 }
 
 /// A mapping that ends at a stage, and what it saw.
@@ -49,13 +49,14 @@ impl Observer for Life {
         self.kept.lock().unwrap().images.insert(found.detections.image.clone(), bytes(found));
     }
 
-    fn recall_structure(&self) -> Option<Fused> {
-        let kept = self.known.lock().unwrap().structure.take()?;
+    fn recall_structure(&self, of: &str) -> Option<Fused> {
+        let (was_of, kept) = self.known.lock().unwrap().structure.take()?;
+        assert_eq!(was_of, of, "the same was seen");
         Some(ciborium::from_reader(kept.as_slice()).unwrap())
     }
 
-    fn structure(&self, fused: &Fused) {
-        self.kept.lock().unwrap().structure = Some(bytes(fused));
+    fn structure(&self, fused: &Fused, of: &str) {
+        self.kept.lock().unwrap().structure = Some((of.to_owned(), bytes(fused)));
     }
 }
 

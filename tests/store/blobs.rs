@@ -165,6 +165,23 @@ async fn uploads_on_their_way_are_swept_once_nobody_knows_them(blobs: &Blobs, da
     assert!(blobs.upload_file(known).exists() && !blobs.upload_file(unknown).exists());
 }
 
+/// As an upload's file is stored, and stored again where that was not noted.
+#[tokio::test]
+async fn another_name_of_a_stored_file_leaves_none_behind() {
+    let data = tempfile::tempdir().unwrap();
+    let blobs = Blobs::in_folder(data.path()).unwrap();
+    let source = data.path().join("source");
+    std::fs::write(&source, b"photo").unwrap();
+    for _ in 0..2 {
+        let link = blobs.staging().join("link");
+        std::fs::hard_link(&source, &link).unwrap();
+        let path = tempfile::TempPath::try_from_path(link).unwrap();
+        blobs.put_file(plant(1), StagedFile { path, size: 5, sha256: Digest::of(b"photo") }).await.unwrap();
+        assert_eq!(files_below(blobs.staging()), 0);
+    }
+    assert_eq!(blobs.get(plant(1), Digest::of(b"photo")).await.unwrap(), "photo");
+}
+
 #[tokio::test]
 async fn a_damaged_blob_is_not_handed_out_and_is_whole_once_its_bytes_come_again() {
     let data = tempfile::tempdir().unwrap();

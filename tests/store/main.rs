@@ -63,6 +63,7 @@ on_both!(
     retry_waits_and_ends,
     the_pause_before_a_retry_grows_while_the_job_gets_nowhere,
     a_job_that_a_worker_cannot_do_waits_for_another,
+    what_is_cancelled_does_not_go_back_to_the_queue,
     checkpoints_live_as_long_as_their_job,
     jobs_by_priority,
     the_last_jobs_pace_is_known,
@@ -119,6 +120,7 @@ on_postgres!(
     an_image_that_is_just_found_is_not_taken_again,
     heartbeats_go_on_while_a_model_is_stored,
     an_image_that_is_found_as_its_job_ends_holds_up_neither,
+    an_end_that_comes_too_late_is_told_to_nobody,
 );
 
 /// A data folder of before there were organisations keeps all that it holds.

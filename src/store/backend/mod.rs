@@ -498,7 +498,7 @@ impl Store for Rows {
             Ending::Cancelled => ("cancelled", None, None, None, now_ms, 0),
             Ending::Released => ("queued", None, None, now_ms, None, 1),
         };
-        let done = sqlx::query(sql::END_JOB)
+        let ended = sqlx::query(sql::END_JOB)
             .bind(claim.job.id.to_string())
             .bind(claim.fence)
             .bind(state)
@@ -507,17 +507,20 @@ impl Store for Rows {
             .bind(run_after_ms)
             .bind(finished_ms)
             .bind(attempts_back)
-            .execute(&mut *tx)
+            .bind(now.as_millisecond())
+            .fetch_optional(&mut *tx)
             .await?;
+        // It may have come into other hands since it was looked at.
+        let Some(ended) = ended else { return Ok(false) };
         if matches!(ending, Ending::Released) {
             tell_of_work(&mut tx).await?;
         }
         sweep(&mut tx, claim.job.id).await?;
-        if finished_ms.is_some() {
+        if ended.try_get::<Option<i64>, _>("finished_ms")?.is_some() {
             announce(&mut tx, claim.job.id, now).await?;
         }
         tx.commit().await?;
-        Ok(done.rows_affected() > 0)
+        Ok(true)
     }
 
     async fn models(&self, plant: PlantId, page: Page) -> Result<Vec<Model>, StoreError> {

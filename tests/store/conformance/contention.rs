@@ -1,8 +1,10 @@
 //! What happens on Postgres where transactions meet: `pool` makes those of others, which stay open for as long as a test
 //! likes. With SQLite they follow each other.
 
-use super::{LEASE, at, claim, enqueue, model, plant, state, survey};
-use heliomap::store::{Claim, Completed, Ending, Heartbeat, ImageTask, JobState, OwnTask, Store};
+use super::{ALL, LEASE, ORGANISATION, at, claim, enqueue, model, plant, state, survey};
+use heliomap::store::{
+    Claim, Completed, Ending, Heartbeat, ImageTask, JobState, NewWebhook, OwnTask, SigningSecret, Store,
+};
 use sqlx::PgPool;
 use std::time::Duration;
 
@@ -111,4 +113,24 @@ pub async fn an_image_that_is_found_as_its_job_ends_holds_up_neither(store: &dyn
     };
     let (found, ()) = tokio::join!(found, meanwhile);
     assert!(!found.unwrap());
+}
+
+pub async fn an_end_that_comes_too_late_is_told_to_nobody(store: &dyn Store, pool: &PgPool) {
+    let secret = SigningSecret::random().unwrap();
+    let new = NewWebhook { organisation: ORGANISATION, plant: None, url: "https://example.org/".to_owned(), secret };
+    let webhook = store.create_webhook(&new, at(0)).await.unwrap().unwrap();
+    let claimed = running(store).await;
+    let mut tx = pool.begin().await.unwrap();
+    let taken = "UPDATE jobs SET fence = fence + 1, worker = 'another' WHERE id = $1";
+    sqlx::query(taken).bind(claimed.job.id.to_string()).execute(&mut *tx).await.unwrap();
+    let ending = Ending::Failed { code: "c".to_owned(), message: "m".to_owned() };
+    let ended = store.end_job(&claimed, &ending, at(31));
+    let meanwhile = async {
+        someone_waits(pool).await;
+        tx.commit().await.unwrap();
+    };
+    let (ended, ()) = tokio::join!(ended, meanwhile);
+    assert!(!ended.unwrap());
+    assert_eq!(state(store, &claimed.job).await, JobState::Running);
+    assert!(store.deliveries(webhook.id, None, ALL).await.unwrap().is_empty());
 }

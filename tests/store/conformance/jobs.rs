@@ -136,6 +136,25 @@ pub async fn a_job_that_a_worker_cannot_do_waits_for_another(store: &dyn Store) 
     assert_eq!((job.state, job.error), (JobState::Queued, Some(("c".to_owned(), "m".to_owned()))));
 }
 
+pub async fn what_is_cancelled_does_not_go_back_to_the_queue(store: &dyn Store) {
+    let survey = survey(store, plant(store, "A").await.id, "June").await;
+    let (code, message) = ("c".to_owned(), "m".to_owned());
+    for ending in [
+        Ending::Retry { code: code.clone(), message: message.clone(), backoff: Duration::from_secs(600) },
+        Ending::Declined { code, message, pause: Duration::from_secs(5) },
+        Ending::Released,
+    ] {
+        let job = enqueue(store, &survey).await;
+        let claimed = claim(store, 0).await.unwrap();
+        // After the worker's last heartbeat.
+        store.cancel_job(job.plant, job.id, at(1)).await.unwrap();
+        assert!(store.end_job(&claimed, &ending, at(2)).await.unwrap());
+        let job = store.job(job.plant, job.id).await.unwrap().unwrap();
+        assert_eq!((job.state, job.finished), (JobState::Cancelled, Some(at(2))), "{ending:?}");
+        assert!(claim(store, 1000).await.is_none());
+    }
+}
+
 pub async fn cancel(store: &dyn Store) {
     let survey = survey(store, plant(store, "A").await.id, "June").await;
     let queued = enqueue(store, &survey).await;

@@ -121,23 +121,34 @@ pub async fn messages_are_sent_by_one_at_a_time_and_not_for_ever(store: &dyn Sto
         }
     }
     assert!(take(100_000).await.is_none());
+    assert!(store.resend_delivery(webhook.id, taken.delivery.id, at(now)).await.unwrap().is_some());
+    for _ in 0..8 {
+        now += 31;
+        take(now).await.unwrap();
+    }
+    // Whoever tried the last time died; the next one tries once more, and then it is given up.
+    now += 31;
+    taken = take(now).await.unwrap();
+    assert_eq!((taken.delivery.attempts, taken.delivery.attempts_left), (17, 0));
+    assert!(store.end_delivery(&taken, &failed(now + 10), at(now)).await.unwrap());
+    assert!(take(100_000).await.is_none());
     let dead = store.deliveries(webhook.id, Some(DeliveryState::Dead), ALL).await.unwrap();
-    assert_eq!((dead.len(), dead[0].attempts, dead[0].error.as_deref()), (1, 8, Some("refused")));
+    assert_eq!((dead.len(), dead[0].attempts, dead[0].error.as_deref()), (1, 17, Some("refused")));
     assert!(store.deliveries(webhook.id, Some(DeliveryState::Waiting), ALL).await.unwrap().is_empty());
 
     let nobody = WebhookId(Uuid::nil());
-    assert!(store.resend_delivery(nobody, dead[0].id, at(200)).await.unwrap().is_none());
-    let waiting = store.resend_delivery(webhook.id, dead[0].id, at(200)).await.unwrap().unwrap();
+    assert!(store.resend_delivery(nobody, dead[0].id, at(1000)).await.unwrap().is_none());
+    let waiting = store.resend_delivery(webhook.id, dead[0].id, at(1000)).await.unwrap().unwrap();
     assert_eq!((waiting.state, waiting.finished), (DeliveryState::Waiting, None));
-    let again = take(200).await.unwrap();
-    assert_eq!(again.delivery.attempts, 9);
-    assert!(store.end_delivery(&again, &Sent::Arrived, at(201)).await.unwrap());
-    assert!(!store.end_delivery(&again, &failed(300), at(202)).await.unwrap());
+    let again = take(1000).await.unwrap();
+    assert_eq!(again.delivery.attempts, 18);
+    assert!(store.end_delivery(&again, &Sent::Arrived, at(1001)).await.unwrap());
+    assert!(!store.end_delivery(&again, &failed(1100), at(1002)).await.unwrap());
     let arrived = store.deliveries(webhook.id, Some(DeliveryState::Delivered), ALL).await.unwrap();
-    assert_eq!((arrived[0].finished, &arrived[0].error), (Some(at(201)), &None));
-    store.forget_old_deliveries(at(201)).await.unwrap();
+    assert_eq!((arrived[0].finished, &arrived[0].error), (Some(at(1001)), &None));
+    store.forget_old_deliveries(at(1001)).await.unwrap();
     assert_eq!(messages(store, &webhook).await.len(), 1);
-    store.forget_old_deliveries(at(202)).await.unwrap();
+    store.forget_old_deliveries(at(1002)).await.unwrap();
     assert!(messages(store, &webhook).await.is_empty());
 }
 
