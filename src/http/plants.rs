@@ -165,7 +165,11 @@ pub async fn delete(
     if conditional::is_asked(&headers) {
         conditional::require(&headers, &PlantView::from(state.require_plant(plant).await?))?;
     }
+    let uploads = state.store.uploads_of_plant(plant).await?;
     state.store.delete_plant(plant, Timestamp::now()).await?;
+    for upload in uploads {
+        state.blobs.drop_upload(upload).await;
+    }
     state.blobs.delete_plant(plant).await?;
     Ok(StatusCode::NO_CONTENT)
 }

@@ -26,6 +26,7 @@ mod sql;
 pub use access::{AccessStore, ApiKey, AuditEntry, KeyId, NewKey, Organisation, OrganisationId, Scope, SecretRecord};
 pub use blobs::{Blobs, Digest, StagedFile, keep_free};
 pub use bucket::Bucket;
+pub use pieces::Piece;
 pub use postgres::PostgresStore;
 pub use records::{
     BlobRecord, Cancelled, Checkpoint, Claim, Completed, Created, Ending, Enqueued, Feature, FeatureQuery, FileRecord,

@@ -1,15 +1,15 @@
-//! Uploads that are not whole, where several servers share a bucket: the server that took some bytes writes them to its own
+//! Uploads that are not whole, where several servers share a bucket: the server that takes some bytes writes them to its own
 //! disk and puts them into the bucket as well, before they count, so that whichever server the client comes back to goes on.
 //!
-//! Each row tells whose disk has all that counts. Another server makes the file anew of its pieces. Servers that write to
-//! one upload at once, because a client left one of them without a word, do not mix: bytes count only where the row still
-//! tells what they were added to.
+//! What counts, the row tells: how many bytes, and which pieces these are. A piece whose bytes did not come to count,
+//! because another server was told of others first, is none of the upload's. A server's disk has the bytes of its own
+//! pieces and all before them, and fetches those behind them.
 
 use super::blobs::io;
 use super::{Blobs, StoreError, UploadId};
 use futures::TryStreamExt;
 use object_store::path::Path as Key;
-use object_store::{ObjectMeta, ObjectStore, ObjectStoreExt};
+use object_store::{ObjectStore, ObjectStoreExt};
 use std::collections::HashSet;
 use std::io::{SeekFrom, Write};
 use std::path::Path;
@@ -24,22 +24,19 @@ const FOLDER: &str = "uploads";
 /// The file of a data folder that names it.
 const NAME: &str = "server-id";
 
-/// Bytes of an upload's file.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
-struct Piece {
-    from: u64,
-    to: u64,
+/// Bytes of an upload's file that are in the bucket.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Piece {
+    /// Where they begin and end in the file.
+    pub from: u64,
+    pub to: u64,
+    pub name: Uuid,
+    /// The data folder whose file of the upload has them, and all before them.
+    pub home: Uuid,
 }
 
-impl Piece {
-    fn key(&self, id: UploadId) -> Key {
-        Key::from(format!("{FOLDER}/{id}/{:020}-{:020}", self.from, self.to))
-    }
-
-    fn of(object: &ObjectMeta) -> Option<Self> {
-        let (from, to) = object.location.filename()?.split_once('-')?;
-        Some(Self { from: from.parse().ok()?, to: to.parse().ok()? })
-    }
+fn key(id: UploadId, name: Uuid) -> Key {
+    Key::from(format!("{FOLDER}/{id}/{name}"))
 }
 
 /// Reads what a data folder is called among those of one bucket; a new one is given a name.
@@ -58,80 +55,59 @@ pub(super) fn name_of(data: &Path) -> std::io::Result<Uuid> {
 }
 
 impl Blobs {
-    /// Puts the bytes from one offset of an upload's file to another into the bucket, where there is one.
-    pub async fn keep_pieces(&self, id: UploadId, from: u64, to: u64) -> Result<(), StoreError> {
-        if self.home.is_none() || from >= to {
-            return Ok(());
-        }
+    /// Puts the bytes from one offset of an upload's file to another into the bucket, where there is one: the pieces that
+    /// they are, in order.
+    pub async fn keep_pieces(&self, id: UploadId, from: u64, to: u64) -> Result<Vec<Piece>, StoreError> {
+        let Some(home) = self.home else { return Ok(Vec::new()) };
         let path = self.upload_file(id);
         let mut file = tokio::fs::File::open(&path).await.map_err(io("open", &path))?;
         file.seek(SeekFrom::Start(from)).await.map_err(io("read", &path))?;
-        let mut at = from;
+        let (mut pieces, mut at) = (Vec::new(), from);
         while at < to {
-            let piece = Piece { from: at, to: to.min(at + PIECE_BYTES) };
+            let piece = Piece { from: at, to: to.min(at + PIECE_BYTES), name: Uuid::new_v4(), home };
             // The semaphore is never closed.
             let _turn = self.senders.acquire().await;
             let mut bytes = vec![0; (piece.to - piece.from) as usize];
             file.read_exact(&mut bytes).await.map_err(io("read", &path))?;
-            self.store.put(&piece.key(id), bytes.into()).await?;
+            self.store.put(&key(id, piece.name), bytes.into()).await?;
             at = piece.to;
+            pieces.push(piece);
         }
-        Ok(())
+        Ok(pieces)
     }
 
-    /// Whether the bucket has the first bytes of an upload, so many.
-    pub async fn has_pieces(&self, id: UploadId, received: u64) -> Result<bool, StoreError> {
-        Ok(self.pieces(id, received).await?.is_some())
+    /// Deletes pieces that did not come to count; what cannot be deleted now goes with the upload.
+    pub async fn drop_pieces(&self, id: UploadId, pieces: &[Piece]) {
+        for piece in pieces {
+            if let Err(error) = self.store.delete(&key(id, piece.name)).await {
+                tracing::warn!(%error, upload = %id, "a piece of an upload cannot be deleted");
+            }
+        }
     }
 
-    /// Makes an upload's file anew of its first bytes, so many; `false` where the bucket lacks some. `has_room` tells
-    /// whether the disk takes more.
-    pub async fn bring_upload(
+    /// Leaves the first bytes of an upload's file, as many as `have`, and adds those of pieces that follow each other.
+    /// `has_room` tells whether the disk takes more.
+    pub async fn bring_pieces(
         &self,
         id: UploadId,
-        received: u64,
+        have: u64,
+        pieces: &[Piece],
         has_room: impl Fn() -> std::io::Result<()>,
-    ) -> Result<bool, StoreError> {
-        let Some(pieces) = self.pieces(id, received).await? else { return Ok(false) };
+    ) -> Result<(), StoreError> {
         let path = self.upload_file(id);
-        let staged =
-            tempfile::Builder::new().prefix("upload-").tempfile_in(&self.staging).map_err(io("create", &path))?;
-        let (file, staged) = staged.into_parts();
-        let mut file = tokio::fs::File::from_std(file);
+        let mut open = tokio::fs::OpenOptions::new();
+        let open = open.write(true).create(true).truncate(have == 0);
+        let mut file = open.open(&path).await.map_err(io("open", &path))?;
+        file.set_len(have).await.map_err(io("write", &path))?;
+        file.seek(SeekFrom::Start(have)).await.map_err(io("write", &path))?;
         for piece in pieces {
             has_room().map_err(io("write", &path))?;
             let _turn = self.senders.acquire().await;
-            let bytes = self.store.get(&piece.key(id)).await?.bytes().await?;
-            if bytes.len() as u64 != piece.to - piece.from {
-                return Ok(false);
-            }
-            file.seek(SeekFrom::Start(piece.from)).await.map_err(io("write", &path))?;
+            let bytes = self.store.get(&key(id, piece.name)).await?.bytes().await?;
             file.write_all(&bytes).await.map_err(io("write", &path))?;
         }
         file.flush().await.map_err(io("write", &path))?;
-        file.set_len(received).await.map_err(io("write", &path))?;
-        file.sync_all().await.map_err(io("write", &path))?;
-        staged.persist(&path).map_err(|error| io("write", &path)(error.error))?;
-        Ok(true)
-    }
-
-    /// The pieces of an upload's first bytes, so many, in order; `None` where some lack.
-    async fn pieces(&self, id: UploadId, received: u64) -> Result<Option<Vec<Piece>>, StoreError> {
-        if self.home.is_none() {
-            return Ok(None);
-        }
-        let folder = Key::from(format!("{FOLDER}/{id}"));
-        let found: Vec<ObjectMeta> = self.store.list(Some(&folder)).try_collect().await?;
-        let mut pieces: Vec<Piece> = found.iter().filter_map(Piece::of).filter(|piece| piece.from < received).collect();
-        pieces.sort();
-        let mut covered = 0;
-        for piece in &pieces {
-            if piece.from > covered {
-                return Ok(None);
-            }
-            covered = covered.max(piece.to);
-        }
-        Ok((covered >= received).then_some(pieces))
+        file.sync_all().await.map_err(io("write", &path))
     }
 
     /// Deletes an upload's bytes, wherever they are; what cannot be deleted now is swept up later.

@@ -240,7 +240,17 @@ pub const UPLOADS_OF_SURVEY: &str =
     concat!(upload!("CAST(NULL AS TEXT)"), "id > $2 AND expires_ms > $4 ORDER BY id LIMIT $3");
 pub const UPLOAD_RECEIVED: &str =
     "UPDATE uploads SET received = $2, expires_ms = $3, home = $4 WHERE id = $1 AND received = $5";
-pub const END_UPLOAD: &str = "UPDATE uploads SET outcome = $2 WHERE id = $1";
+pub const ADD_PIECES: &str = "INSERT INTO upload_pieces (upload_id, begins, ends, name, home) ";
+pub const UPLOAD_PIECES: &str =
+    "SELECT begins, ends, name, home FROM upload_pieces WHERE upload_id = $1 ORDER BY begins";
+pub const TAKE_UPLOAD_END: &str = "\
+    UPDATE uploads SET ender = $2, ending_until_ms = $3 \
+    WHERE id = $1 AND outcome IS NULL AND (ending_until_ms < $4 OR ender = $2)";
+pub const END_UPLOAD: &str = "\
+    UPDATE uploads SET outcome = $3, ender = NULL, ending_until_ms = 0 \
+    WHERE id = $1 AND outcome IS NULL AND ender = $2";
+pub const UPLOADS_OF_PLANT: &str = "\
+    SELECT uploads.id FROM uploads JOIN surveys ON surveys.id = uploads.survey_id WHERE surveys.plant_id = $1";
 pub const DELETE_UPLOAD: &str = "DELETE FROM uploads WHERE survey_id = $1 AND id = $2";
 pub const DELETE_EXPIRED_UPLOADS: &str = "DELETE FROM uploads WHERE expires_ms <= $1";
 pub const OWNER_OF_SURVEY: &str =

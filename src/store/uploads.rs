@@ -2,9 +2,11 @@
 
 use super::records::row_id;
 use super::usage::Quotas;
-use super::{StoreError, SurveyId};
+use super::{Piece, StoreError, SurveyId};
+use crate::plant::PlantId;
 use jiff::Timestamp;
 use std::fmt;
+use std::time::Duration;
 use uuid::Uuid;
 
 row_id!(
@@ -67,21 +69,35 @@ pub trait UploadStore: Send + Sync + 'static {
         limit: u32,
         now: Timestamp,
     ) -> Result<Vec<Upload>, StoreError>;
-    /// Notes how many bytes are safe, in which data folder, and a new end of its life; `false` where the upload is gone, or
-    /// is not as it was told.
+    /// Notes how many bytes are safe, in which data folder and in which further pieces, and a new end of its life; `false`
+    /// where the upload is gone, or is not as it was told.
     async fn upload_received(
         &self,
         upload: &Upload,
         received: u64,
         home: Option<Uuid>,
+        pieces: &[Piece],
         expires: Timestamp,
     ) -> Result<bool, StoreError>;
-    /// Notes what became of the whole file, JSON.
-    async fn end_upload(&self, id: UploadId, outcome: &str) -> Result<(), StoreError>;
+    /// The pieces that count, in order.
+    async fn upload_pieces(&self, id: UploadId) -> Result<Vec<Piece>, StoreError>;
+    /// Takes a whole file that nobody else is storing, or goes on to have it, until `lease` is over; `false` where somebody
+    /// is, where it is known what became of it, or where it is gone.
+    async fn take_upload_end(
+        &self,
+        id: UploadId,
+        token: Uuid,
+        lease: Duration,
+        now: Timestamp,
+    ) -> Result<bool, StoreError>;
+    /// Notes what became of the whole file, JSON, by whoever has it; where nothing is to be noted, others may take it.
+    async fn end_upload(&self, id: UploadId, token: Uuid, outcome: Option<&str>) -> Result<(), StoreError>;
     /// Forgets an upload; whether there was one.
     async fn delete_upload(&self, survey: SurveyId, id: UploadId) -> Result<bool, StoreError>;
     /// Forgets uploads whose time is over.
     async fn delete_expired_uploads(&self, now: Timestamp) -> Result<(), StoreError>;
+    /// A plant's uploads.
+    async fn uploads_of_plant(&self, plant: PlantId) -> Result<Vec<UploadId>, StoreError>;
     /// All uploads that are known.
     async fn uploads(&self) -> Result<Vec<UploadId>, StoreError>;
 }

@@ -4,9 +4,10 @@ use crate::app::{App, assert_problem, jpeg, json_of};
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
 use futures::StreamExt;
-use heliomap::store::Digest;
+use heliomap::store::{Digest, UploadId};
 use reqwest::{Method, RequestBuilder, Response, StatusCode};
 use serde_json::{Value, json};
+use std::time::Duration;
 
 fn tus(app: &App, method: Method, path: &str) -> RequestBuilder {
     app.request(method, path).header("tus-resumable", "1.0.0")
@@ -411,4 +412,25 @@ async fn wrong_requests_are_refused() {
     let post = tus(&app, Method::POST, &begun).header("x-http-method-override", "PATCH").header("upload-offset", 0);
     let post = post.header("content-type", "application/offset+octet-stream").body("abc").send().await.unwrap();
     assert_eq!(post.status(), StatusCode::NO_CONTENT);
+}
+
+#[tokio::test]
+async fn a_whole_file_that_another_server_is_storing_is_busy() {
+    let app = App::new(&[]).await;
+    let survey = app.survey().await;
+    let photo = jpeg(64, 48);
+    let upload = begin(&app, &survey, photo.len(), &metadata("filename", "a.jpg")).await;
+    let id = UploadId(upload.rsplit('/').next().unwrap().parse().unwrap());
+    let (other, lease) = (uuid::Uuid::from_u128(7), Duration::from_secs(60));
+    assert!(app.store.take_upload_end(id, other, lease, jiff::Timestamp::now()).await.unwrap());
+    let last = more(&app, &upload, 0, &photo).send().await.unwrap();
+    assert!(last.headers()["retry-after"].to_str().unwrap().parse::<u64>().unwrap() > 0);
+    assert_problem(problem(last).await, 423, "upload_busy", "just being stored");
+    let head = tus(&app, Method::HEAD, &upload).send().await.unwrap();
+    assert_eq!(head.status(), StatusCode::LOCKED);
+    // It could not store it: whoever is asked next does.
+    app.store.end_upload(id, other, None).await.unwrap();
+    assert_eq!(offset(&app, &upload).await, photo.len().to_string());
+    let (_, view) = app.get(&upload).await;
+    assert_eq!(view["state"], "stored", "{view}");
 }

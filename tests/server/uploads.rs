@@ -2,9 +2,10 @@
 
 use super::{Program, client, jpeg};
 use reqwest::StatusCode;
-use reqwest::blocking::Client;
+use reqwest::blocking::{Body, Client};
 use serde_json::{Value, json};
 use sha2::Digest;
+use std::io::Read;
 use std::path::Path;
 use std::process::{Command, Stdio};
 
@@ -34,6 +35,28 @@ fn begin(client: &Client, survey: &str, length: usize, concat: Option<&str>) -> 
     let answer = request.send().unwrap();
     assert_eq!(answer.status(), StatusCode::CREATED, "{}", answer.text().unwrap());
     answer.headers()["location"].to_str().unwrap().to_owned()
+}
+
+/// Bytes that come at once, and others that come later.
+struct Line {
+    now: Vec<u8>,
+    rest: std::sync::mpsc::Receiver<Vec<u8>>,
+}
+
+impl Read for Line {
+    fn read(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
+        if self.now.is_empty() {
+            self.now = self.rest.recv().unwrap_or_default();
+        }
+        let count = self.now.len().min(buffer.len());
+        buffer[..count].copy_from_slice(&self.now[..count]);
+        self.now.drain(..count);
+        Ok(count)
+    }
+}
+
+fn hex(bytes: &[u8]) -> String {
+    sha2::Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 fn digest(client: &Client, survey: &str, path: &str) -> Value {
@@ -84,7 +107,7 @@ fn an_upload_goes_on_at_whichever_server_is_there() {
 
     let mut photo = jpeg();
     photo.extend((0..20_000_000_u32).map(|k| (k.wrapping_mul(2_654_435_761) >> 24) as u8));
-    let expected: String = sha2::Sha256::digest(&photo).iter().map(|byte| format!("{byte:02x}")).collect();
+    let expected = hex(&photo);
     let upload = begin(&client, &format!("{here}{survey}"), photo.len(), None);
     assert_eq!(put(&client, &format!("{here}{upload}"), 0, &photo[..9_000_000]), StatusCode::NO_CONTENT);
     // The server that took the first bytes is gone, and its disk with it.
@@ -109,9 +132,31 @@ fn an_upload_goes_on_at_whichever_server_is_there() {
     assert_eq!(digest(&client, &format!("{elsewhere}{survey}"), "images/a.jpg"), expected);
     assert_eq!(offset(&client, &format!("{elsewhere}{upload}")), photo.len());
 
+    // A line that nobody uses any more holds bytes that never count, whichever server they came to.
+    photo.push(0);
+    let upload = begin(&client, &format!("{there}{survey}"), photo.len(), None);
+    let (more, rest) = std::sync::mpsc::channel();
+    let (line, url, first) = (client.clone(), format!("{there}{upload}"), photo[..9_000_000].to_vec());
+    let stale = std::thread::spawn(move || {
+        let request = line.patch(url).header("tus-resumable", "1.0.0").header("upload-offset", 0);
+        let request = request.header("content-type", "application/offset+octet-stream");
+        request.body(Body::new(Line { now: first, rest })).send().unwrap().status()
+    });
+    while offset(&client, &format!("{elsewhere}{upload}")) == 0 {
+        std::thread::sleep(std::time::Duration::from_millis(50));
+    }
+    let counted = offset(&client, &format!("{elsewhere}{upload}"));
+    let end = counted + 1_000_000;
+    assert_eq!(put(&client, &format!("{elsewhere}{upload}"), counted, &photo[counted..end]), StatusCode::NO_CONTENT);
+    more.send(vec![7; 3_000_000]).unwrap();
+    drop(more);
+    assert_eq!(stale.join().unwrap(), StatusCode::BAD_REQUEST, "another request went on with the upload");
+    assert_eq!(put(&client, &format!("{there}{upload}"), end, &photo[end..]), StatusCode::NO_CONTENT);
+    assert_eq!(digest(&client, &format!("{there}{survey}"), "images/a.jpg"), hex(&photo));
+
     // Parts that went to two servers become one file at either.
     photo.push(0);
-    let expected: String = sha2::Sha256::digest(&photo).iter().map(|byte| format!("{byte:02x}")).collect();
+    let expected = hex(&photo);
     let (left, right) = photo.split_at(12_000_000);
     let parts = [(&there, left), (&elsewhere, right)].map(|(server, bytes)| {
         let part = begin(&client, &format!("{server}{survey}"), bytes.len(), Some("partial"));
@@ -123,6 +168,6 @@ fn an_upload_goes_on_at_whichever_server_is_there() {
 
     let list = format!("{endpoint}/heliomap-tests?list-type=2&prefix={prefix}/");
     let left = client.get(list).send().unwrap().text().unwrap();
-    assert_eq!(left.matches("<Key>").count(), 2, "the pieces are gone: {left}");
+    assert_eq!(left.matches("<Key>").count(), 3, "the pieces are gone, and three photos are left: {left}");
     assert_eq!(std::fs::read_dir(place.path().join("third/incoming")).unwrap().count(), 0);
 }

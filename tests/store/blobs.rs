@@ -214,36 +214,40 @@ async fn an_upload_goes_on_at_another_server() {
     let id = UploadId(Uuid::from_u128(1));
     let bytes: Vec<u8> = (0..20_000_000_u32).map(|k| (k.wrapping_mul(2_654_435_761) >> 24) as u8).collect();
     let room = || Ok(());
-    assert!(there.bring_upload(id, 0, room).await.unwrap(), "nothing came yet");
+    let file_of = |blobs: &Blobs| std::fs::read(blobs.upload_file(id)).unwrap();
+    there.bring_pieces(id, 0, &[], room).await.unwrap();
+    assert!(file_of(there).is_empty(), "nothing came yet");
 
     std::fs::write(here.upload_file(id), &bytes).unwrap();
-    // Larger than one piece, and one whose end was not told any more.
-    here.keep_pieces(id, 0, 18_000_000).await.unwrap();
-    here.keep_pieces(id, 18_000_000, 19_000_000).await.unwrap();
-    assert!(!there.has_pieces(id, 19_000_001).await.unwrap());
-    assert!(!there.bring_upload(id, 20_000_000, room).await.unwrap());
+    let first = here.keep_pieces(id, 0, 18_000_000).await.unwrap();
+    assert_eq!((first.len(), first[0].from, first[2].to), (3, 0, 18_000_000));
+    assert!(first.iter().all(|piece| Some(piece.home) == here.home()));
     let full = || Err(std::io::ErrorKind::StorageFull.into());
-    assert!(there.bring_upload(id, 18_000_000, full).await.unwrap_err().is_full());
-    assert!(there.bring_upload(id, 18_000_000, room).await.unwrap());
-    assert!(std::fs::read(there.upload_file(id)).unwrap() == bytes[..18_000_000]);
+    assert!(there.bring_pieces(id, 0, &first, full).await.unwrap_err().is_full());
+    there.bring_pieces(id, 0, &first, room).await.unwrap();
+    assert!(file_of(there) == bytes[..18_000_000]);
 
-    // It goes on there from what counted, and here again.
+    // It goes on there from what counted, and here again: what did not count here goes.
     std::fs::write(there.upload_file(id), &bytes).unwrap();
-    there.keep_pieces(id, 18_000_000, 20_000_000).await.unwrap();
-    assert!(here.has_pieces(id, 20_000_000).await.unwrap());
-    std::fs::remove_file(here.upload_file(id)).unwrap();
-    assert!(here.bring_upload(id, 20_000_000, room).await.unwrap());
-    assert!(std::fs::read(here.upload_file(id)).unwrap() == bytes);
-    assert_eq!(files_below(here.staging()) + files_below(there.staging()), 0);
+    let second = there.keep_pieces(id, 18_000_000, 20_000_000).await.unwrap();
+    std::fs::write(here.upload_file(id), [&bytes[..18_000_000], &[7; 3_000_000]].concat()).unwrap();
+    here.bring_pieces(id, 18_000_000, &second, room).await.unwrap();
+    assert!(file_of(here) == bytes);
 
     // Once nobody knows it, its pieces go.
+    let is_there = async || there.bring_pieces(id, 0, &second, room).await.is_ok();
     there.sweep_uploads(HashSet::from([id]), Duration::ZERO).await.unwrap();
-    assert!(there.has_pieces(id, 1).await.unwrap());
+    assert!(is_there().await);
     there.sweep_uploads(HashSet::new(), Duration::from_secs(3600)).await.unwrap();
-    assert!(there.has_pieces(id, 1).await.unwrap(), "it may be just beginning");
+    assert!(is_there().await, "it may be just beginning");
     there.sweep_uploads(HashSet::new(), Duration::ZERO).await.unwrap();
-    assert!(!there.has_pieces(id, 1).await.unwrap());
-    here.keep_pieces(id, 0, 10).await.unwrap();
-    here.drop_upload(id).await;
-    assert!(!here.upload_file(id).exists() && !here.has_pieces(id, 1).await.unwrap());
+    assert!(!is_there().await);
+    std::fs::write(there.upload_file(id), &bytes).unwrap();
+    let kept = there.keep_pieces(id, 0, 20).await.unwrap();
+    there.drop_pieces(id, &kept).await;
+    assert!(there.bring_pieces(id, 0, &kept, room).await.is_err());
+    std::fs::write(there.upload_file(id), &bytes).unwrap();
+    let kept = there.keep_pieces(id, 0, 20).await.unwrap();
+    there.drop_upload(id).await;
+    assert!(!there.upload_file(id).exists() && there.bring_pieces(id, 0, &kept, room).await.is_err());
 }

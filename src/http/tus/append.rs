@@ -1,8 +1,9 @@
 //! More of an upload comes, and is made safe step by step.
 
+use super::bytes::bring_here;
 use super::finish::finish;
 use super::protocol::{Checksum, UPLOAD_EXPIRES, UPLOAD_OFFSET, answer, http_date, number, text, wrong};
-use super::{LIFE, UploadPath, bring_here, found, take_over};
+use super::{LIFE, UploadPath, found, take_over};
 use crate::http::AppState;
 use crate::http::error::{ApiError, Code, Problem};
 use crate::http::extract::ApiPath;
@@ -223,9 +224,10 @@ async fn secure(
 ) -> Result<(), ApiError> {
     file.flush().await.map_err(|error| disk(path, error))?;
     file.get_ref().sync_data().await.map_err(|error| disk(path, error))?;
-    state.blobs.keep_pieces(upload.id, upload.received, at).await?;
+    let pieces = state.blobs.keep_pieces(upload.id, upload.received, at).await?;
     let (home, expires) = (state.blobs.home(), Timestamp::now() + LIFE);
-    if !state.store.upload_received(upload, at, home, expires).await? {
+    if !state.store.upload_received(upload, at, home, &pieces, expires).await? {
+        state.blobs.drop_pieces(upload.id, &pieces).await;
         return Err(match state.store.upload(upload.survey, upload.id).await? {
             None => ApiError::new(Code::UploadNotFound, "the upload was ended meanwhile"),
             Some(_) => taken_over(),

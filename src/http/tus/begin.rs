@@ -1,9 +1,11 @@
 //! Uploads begin, or are put together from their parts.
 
+use super::bytes::bring_here;
+use super::desk::Taken;
 use super::finish::finish;
 use super::place::Place;
 use super::protocol::{UPLOAD_EXPIRES, answer, http_date, number, require_version, text, wrong};
-use super::{LIFE, bring_here, place, require_upload};
+use super::{LIFE, place, require_upload};
 use crate::http::AppState;
 use crate::http::error::{ApiError, Problem};
 use crate::http::extract::ApiPath;
@@ -78,9 +80,9 @@ async fn create_upload(
     }
     let concat = text(headers, "upload-concat")?;
     let partial = concat == Some("partial");
-    let parts = match concat.and_then(|concat| concat.strip_prefix("final;")) {
-        Some(urls) => Some(finished_parts(state, survey, urls).await?),
-        None if concat.is_none() || partial => None,
+    let (parts, _taken) = match concat.and_then(|concat| concat.strip_prefix("final;")) {
+        Some(urls) => finished_parts(state, survey, urls).await.map(|(parts, taken)| (Some(parts), taken))?,
+        None if concat.is_none() || partial => (None, Vec::new()),
         None => return Err(wrong("Upload-Concat must be `partial`, or `final;` and the URLs of the parts")),
     };
     let length = match &parts {
@@ -152,9 +154,9 @@ fn put_together(sources: &[PathBuf], target: &Path, has_room: impl Fn() -> io::R
     whole.sync_all()
 }
 
-/// The parts of a file, all of which must be whole, and each of which is named once.
-async fn finished_parts(state: &AppState, survey: SurveyId, urls: &str) -> Result<Vec<Upload>, ApiError> {
-    let (mut parts, mut named) = (Vec::new(), HashSet::new());
+/// The parts of a file, all of which must be whole, and each of which is named once, in the hands of this request.
+async fn finished_parts(state: &AppState, survey: SurveyId, urls: &str) -> Result<(Vec<Upload>, Vec<Taken>), ApiError> {
+    let (mut parts, mut named, mut taken) = (Vec::new(), HashSet::new(), Vec::new());
     for url in urls.split_ascii_whitespace() {
         let id = url.rsplit('/').next().and_then(|id| Uuid::try_parse(id).ok()).map(UploadId);
         let part =
@@ -162,10 +164,11 @@ async fn finished_parts(state: &AppState, survey: SurveyId, urls: &str) -> Resul
         if !part.partial || part.received < part.length {
             return Err(wrong(format!("{url} is no part that is whole")));
         }
-        bring_here(state, &part).await?;
         if !named.insert(part.id) {
             return Err(wrong(format!("{url} is named twice")));
         }
+        taken.push(state.desk.take(part.id).await?);
+        bring_here(state, &part).await?;
         parts.push(part);
         if parts.len() > MAX_PARTS {
             return Err(wrong(format!("a file may have {MAX_PARTS} parts at the most")));
@@ -174,7 +177,7 @@ async fn finished_parts(state: &AppState, survey: SurveyId, urls: &str) -> Resul
     if parts.is_empty() {
         return Err(wrong("Upload-Concat names no parts"));
     }
-    Ok(parts)
+    Ok((parts, taken))
 }
 
 #[cfg(test)]

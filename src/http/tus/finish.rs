@@ -3,28 +3,55 @@
 use super::Outcome;
 use super::place::Place;
 use crate::http::AppState;
-use crate::http::error::ApiError;
+use crate::http::error::{ApiError, Code};
 use crate::http::intake::{self, disk};
 use crate::http::uploads::{self, UploadedFile};
 use crate::plant::PlantId;
-use crate::store::{Digest, StagedFile, Upload};
+use crate::store::{Digest, StagedFile, Upload, UploadId};
+use jiff::Timestamp;
+use std::convert::Infallible;
+use std::time::Duration;
 use uuid::Uuid;
+
+/// How long after a server fell silent another may store the whole file.
+const LEASE: Duration = Duration::from_secs(10);
 
 /// Checks a whole file and stores it in its survey, once; a part waits for the others.
 pub(super) async fn finish(state: &AppState, plant: PlantId, upload: &Upload) -> Result<(), ApiError> {
     if upload.partial || upload.outcome.is_some() {
         return Ok(());
     }
-    let stored = store_whole(state, plant, upload).await;
+    let token = Uuid::new_v4();
+    if !state.store.take_upload_end(upload.id, token, LEASE, Timestamp::now()).await? {
+        let busy = ApiError::new(Code::UploadBusy, "the whole file is just being stored; ask again how it stands");
+        return Err(busy.retry_after(2));
+    }
+    let stored = tokio::select! {
+        stored = store_whole(state, plant, upload) => stored,
+        never = keep_taken(state, upload.id, token) => match never {},
+    };
     let outcome = match &stored {
         Ok(files) => Outcome { files: files.iter().map(|file| serde_json::json!(file)).collect(), problem: None },
         // The service failed, not the file: it is tried again when the client asks how the upload stands.
-        Err(problem) if problem.code.parts().0.is_server_error() => return stored.map(drop),
+        Err(problem) if problem.code.parts().0.is_server_error() => {
+            state.store.end_upload(upload.id, token, None).await?;
+            return stored.map(drop);
+        }
         Err(problem) => Outcome { files: Vec::new(), problem: Some(problem.document()) },
     };
-    state.store.end_upload(upload.id, &serde_json::json!(outcome).to_string()).await?;
+    state.store.end_upload(upload.id, token, Some(&serde_json::json!(outcome).to_string())).await?;
     state.blobs.drop_upload(upload.id).await;
     stored.map(drop)
+}
+
+/// Goes on to have a file that is being stored, for as long as it is polled: no other server stores it, too.
+async fn keep_taken(state: &AppState, id: UploadId, token: Uuid) -> Infallible {
+    loop {
+        tokio::time::sleep(LEASE / 4).await;
+        if let Err(error) = state.store.take_upload_end(id, token, LEASE, Timestamp::now()).await {
+            tracing::warn!(%error, upload = %id, "an upload that is being stored may be taken by another server");
+        }
+    }
 }
 
 async fn store_whole(state: &AppState, plant: PlantId, upload: &Upload) -> Result<Vec<UploadedFile>, ApiError> {

@@ -9,6 +9,7 @@ pub mod append;
 pub mod begin;
 pub mod list;
 
+mod bytes;
 mod desk;
 mod finish;
 mod place;
@@ -19,15 +20,15 @@ pub use desk::Desk;
 use super::AppState;
 use super::error::{ApiError, Code, Problem};
 use super::extract::ApiPath;
-use super::intake::disk;
 use super::uploads::UploadedFile;
 use crate::plant::PlantId;
-use crate::store::{SurveyId, Upload, UploadId, keep_free};
+use crate::store::{SurveyId, Upload, UploadId};
 use axum::Json;
 use axum::body::Body;
 use axum::extract::State;
 use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
 use axum::response::{IntoResponse, Response};
+use bytes::{bring_here, require_somewhere};
 use desk::Taken;
 use finish::finish;
 use jiff::{SignedDuration, Timestamp};
@@ -35,6 +36,7 @@ use place::Place;
 use protocol::{ALGORITHMS, EXTENSIONS, UPLOAD_EXPIRES, UPLOAD_OFFSET, VERSION, answer, http_date, require_version};
 use serde::{Deserialize, Serialize};
 use std::str::FromStr;
+use tracing::Instrument;
 
 /// How long an upload lives after its last byte.
 const LIFE: SignedDuration = SignedDuration::from_hours(24);
@@ -173,38 +175,6 @@ async fn require_upload(state: &AppState, survey: SurveyId, id: UploadId) -> Res
     })
 }
 
-/// Whether the file of an upload is in this machine's data folder, with all bytes that count.
-async fn is_here(state: &AppState, upload: &Upload) -> Result<bool, ApiError> {
-    let file = state.blobs.upload_file(upload.id);
-    let length = match tokio::fs::metadata(&file).await {
-        Ok(found) => Some(found.len()),
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => None,
-        Err(error) => return Err(disk(&file, error)),
-    };
-    let at_home = upload.home.is_none() || upload.home == state.blobs.home();
-    Ok(upload.outcome.is_some() || (at_home && length.is_some_and(|length| length >= upload.received)))
-}
-
-/// Brings the bytes of an upload here where another server took them.
-async fn bring_here(state: &AppState, upload: &Upload) -> Result<(), ApiError> {
-    let (staging, reserve) = (state.blobs.staging(), state.limits.disk_reserve);
-    let has_room = || keep_free(staging, reserve);
-    if is_here(state, upload).await? || state.blobs.bring_upload(upload.id, upload.received, has_room).await? {
-        return Ok(());
-    }
-    Err(nowhere())
-}
-
-/// Refuses to go on with an upload whose bytes are neither here nor can be brought here.
-async fn require_somewhere(state: &AppState, upload: &Upload) -> Result<(), ApiError> {
-    let somewhere = is_here(state, upload).await? || state.blobs.has_pieces(upload.id, upload.received).await?;
-    if somewhere { Ok(()) } else { Err(nowhere()) }
-}
-
-fn nowhere() -> ApiError {
-    ApiError::new(Code::UploadNotFound, "the upload's bytes are not on this machine any more: begin a new one")
-}
-
 /// What this service speaks of the tus protocol
 #[utoipa::path(
     options,
@@ -255,10 +225,17 @@ pub async fn head(State(state): State<AppState>, ApiPath(path): ApiPath<UploadPa
 }
 
 async fn tell(state: &AppState, path: &UploadPath, headers: &HeaderMap) -> Result<Response, ApiError> {
-    let (_taken, upload) = take(state, path, headers).await?;
+    let (taken, upload) = take(state, path, headers).await?;
     if upload.received == upload.length {
-        bring_here(state, &upload).await?;
-        finish(state, path.plant, &upload).await?;
+        // It comes to its end though the client does not wait for it.
+        let (state, upload, plant) = (state.clone(), upload.clone(), path.plant);
+        let tasks = state.answering.clone();
+        let ending = async move {
+            let _taken = taken;
+            bring_here(&state, &upload).await?;
+            finish(&state, plant, &upload).await
+        };
+        tasks.spawn(ending.in_current_span()).await.map_err(|error| ApiError::internal(&error))??;
     } else {
         require_somewhere(state, &upload).await?;
     }

@@ -1,13 +1,18 @@
 //! Uploads that may be resumed.
 
-use super::super::{Rows, Tx};
+use super::super::{Db, Row, Rows, Tx};
 use super::read;
 use super::usage::quotas;
-use crate::store::{StoreError, SurveyId, Upload, UploadBounds, UploadId, UploadStore, sql};
+use crate::plant::PlantId;
+use crate::store::{Piece, StoreError, SurveyId, Upload, UploadBounds, UploadId, UploadStore, sql};
 use async_trait::async_trait;
 use jiff::Timestamp;
-use sqlx::Row as _;
+use sqlx::{QueryBuilder, Row as _};
+use std::time::Duration;
 use uuid::Uuid;
+
+/// Pieces that one statement inserts; a row has five parameters.
+const PIECES_AT_ONCE: usize = 500;
 
 #[async_trait]
 impl UploadStore for Rows {
@@ -63,19 +68,65 @@ impl UploadStore for Rows {
         upload: &Upload,
         received: u64,
         home: Option<Uuid>,
+        pieces: &[Piece],
         expires: Timestamp,
     ) -> Result<bool, StoreError> {
+        let mut tx = self.begin().await?;
         let query = sqlx::query(sql::UPLOAD_RECEIVED)
             .bind(upload.id.to_string())
             .bind(received as i64)
             .bind(expires.as_millisecond())
             .bind(home.map(|home| home.to_string()))
             .bind(upload.received as i64);
+        if query.execute(&mut *tx).await?.rows_affected() == 0 {
+            return Ok(false);
+        }
+        for pieces in pieces.chunks(PIECES_AT_ONCE) {
+            let mut insert = QueryBuilder::<Db>::new(sql::ADD_PIECES);
+            insert.push_values(pieces, |mut row, piece| {
+                row.push_bind(upload.id.to_string())
+                    .push_bind(piece.from as i64)
+                    .push_bind(piece.to as i64)
+                    .push_bind(piece.name.to_string())
+                    .push_bind(piece.home.to_string());
+            });
+            insert.build().persistent(false).execute(&mut *tx).await?;
+        }
+        tx.commit().await?;
+        Ok(true)
+    }
+
+    async fn upload_pieces(&self, id: UploadId) -> Result<Vec<Piece>, StoreError> {
+        let rows = sqlx::query(sql::UPLOAD_PIECES).bind(id.to_string()).fetch_all(&self.read).await?;
+        let piece = |row: &Row| {
+            Ok(Piece {
+                from: row.try_get::<i64, _>("begins")? as u64,
+                to: row.try_get::<i64, _>("ends")? as u64,
+                name: read::uuid(row, "name")?,
+                home: read::uuid(row, "home")?,
+            })
+        };
+        rows.iter().map(piece).collect()
+    }
+
+    async fn take_upload_end(
+        &self,
+        id: UploadId,
+        token: Uuid,
+        lease: Duration,
+        now: Timestamp,
+    ) -> Result<bool, StoreError> {
+        let query = sqlx::query(sql::TAKE_UPLOAD_END)
+            .bind(id.to_string())
+            .bind(token.to_string())
+            .bind(super::after(now, lease))
+            .bind(now.as_millisecond());
         Ok(query.execute(&self.write).await?.rows_affected() > 0)
     }
 
-    async fn end_upload(&self, id: UploadId, outcome: &str) -> Result<(), StoreError> {
-        sqlx::query(sql::END_UPLOAD).bind(id.to_string()).bind(outcome).execute(&self.write).await?;
+    async fn end_upload(&self, id: UploadId, token: Uuid, outcome: Option<&str>) -> Result<(), StoreError> {
+        let query = sqlx::query(sql::END_UPLOAD).bind(id.to_string()).bind(token.to_string()).bind(outcome);
+        query.execute(&self.write).await?;
         Ok(())
     }
 
@@ -87,6 +138,11 @@ impl UploadStore for Rows {
     async fn delete_expired_uploads(&self, now: Timestamp) -> Result<(), StoreError> {
         sqlx::query(sql::DELETE_EXPIRED_UPLOADS).bind(now.as_millisecond()).execute(&self.write).await?;
         Ok(())
+    }
+
+    async fn uploads_of_plant(&self, plant: PlantId) -> Result<Vec<UploadId>, StoreError> {
+        let rows = sqlx::query(sql::UPLOADS_OF_PLANT).bind(plant.to_string()).fetch_all(&self.read).await?;
+        rows.iter().map(|row| Ok(UploadId(read::uuid(row, "id")?))).collect()
     }
 
     async fn uploads(&self) -> Result<Vec<UploadId>, StoreError> {

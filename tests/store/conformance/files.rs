@@ -1,9 +1,9 @@
 //! Files of surveys, and how they come.
 
-use super::{at, claim, enqueue, file, model, plant, put, reserve, survey};
+use super::{LEASE, at, claim, enqueue, file, model, plant, put, reserve, survey};
 use heliomap::reconstruction::PhotoFacts;
 use heliomap::store::{
-    Digest, FileRecord, FileWritten, Store, StoreError, SurveyId, SurveyPath, Upload, UploadId, Wanted,
+    Digest, FileRecord, FileWritten, Piece, Store, StoreError, SurveyId, SurveyPath, Upload, UploadId, Wanted,
 };
 use uuid::Uuid;
 
@@ -79,14 +79,31 @@ pub async fn uploads(store: &dyn Store) {
     store.create_upload(&upload, None, at(0)).await.unwrap();
     assert_eq!(store.upload(survey.id, id).await.unwrap(), Some(upload.clone()));
     assert_eq!(store.upload(SurveyId(Uuid::nil()), id).await.unwrap(), None);
-    let home = Some(Uuid::from_u128(8));
-    assert!(store.upload_received(&upload, 1 << 33, home, at(200)).await.unwrap());
+    let home = Uuid::from_u128(8);
+    let piece = |from: u64, to: u64| Piece { from, to, name: Uuid::from_u128(from.into()), home };
+    let pieces = [piece(0, 1 << 32), piece(1 << 32, 1 << 33)];
+    assert!(store.upload_received(&upload, 1 << 33, Some(home), &pieces, at(200)).await.unwrap());
     // Who does not know of that, on another server, does not count on.
-    assert!(!store.upload_received(&upload, 1 << 32, None, at(300)).await.unwrap());
+    assert!(!store.upload_received(&upload, 1 << 32, None, &pieces[..1], at(300)).await.unwrap());
     let unknown = Upload { id: UploadId(Uuid::nil()), ..upload.clone() };
-    assert!(!store.upload_received(&unknown, 1, None, at(200)).await.unwrap());
-    store.end_upload(id, "{}").await.unwrap();
-    (upload.received, upload.home, upload.expires, upload.outcome) = (1 << 33, home, at(200), Some("{}".to_owned()));
+    assert!(!store.upload_received(&unknown, 1, None, &[], at(200)).await.unwrap());
+    assert_eq!(store.upload_pieces(id).await.unwrap(), pieces);
+    assert_eq!(store.uploads_of_plant(survey.plant).await.unwrap(), [id]);
+    // One server stores the whole file, unless it falls silent.
+    let [one, other] = [1, 2].map(Uuid::from_u128);
+    assert!(store.take_upload_end(id, one, LEASE, at(10)).await.unwrap());
+    assert!(!store.take_upload_end(id, other, LEASE, at(20)).await.unwrap());
+    assert!(store.take_upload_end(id, one, LEASE, at(20)).await.unwrap());
+    assert!(!store.take_upload_end(id, other, LEASE, at(45)).await.unwrap());
+    assert!(store.take_upload_end(id, other, LEASE, at(51)).await.unwrap());
+    store.end_upload(id, one, Some("[]")).await.unwrap();
+    assert_eq!(store.upload(survey.id, id).await.unwrap().unwrap().outcome, None);
+    store.end_upload(id, other, None).await.unwrap();
+    assert!(store.take_upload_end(id, one, LEASE, at(52)).await.unwrap());
+    store.end_upload(id, one, Some("{}")).await.unwrap();
+    assert!(!store.take_upload_end(id, one, LEASE, at(53)).await.unwrap());
+    (upload.received, upload.home, upload.expires, upload.outcome) =
+        (1 << 33, Some(home), at(200), Some("{}".to_owned()));
     assert_eq!(store.upload(survey.id, id).await.unwrap(), Some(upload.clone()));
     let ids = (1..=3).map(|number| UploadId(Uuid::from_u128(number << 64))).collect::<Vec<_>>();
     for (id, expires) in ids.iter().zip([150, 150, 100]) {

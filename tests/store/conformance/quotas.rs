@@ -1,6 +1,6 @@
 //! What organisations keep, and may keep.
 
-use super::{ORGANISATION, at, claim, enqueue, model, plant, survey};
+use super::{LEASE, ORGANISATION, at, claim, enqueue, model, plant, survey};
 use heliomap::plant::PlantId;
 use heliomap::store::usage::UNLIMITED;
 use heliomap::store::{
@@ -55,7 +55,8 @@ pub async fn quotas(store: &dyn Store) {
     for upload in [upload(1, 7, false, 9), upload(2, 70, true, 9), upload(3, 700, false, 4)] {
         store.create_upload(&upload, None, at(0)).await.unwrap();
         if let Some(outcome) = &upload.outcome {
-            store.end_upload(upload.id, outcome).await.unwrap();
+            assert!(store.take_upload_end(upload.id, upload.id.0, LEASE, at(0)).await.unwrap());
+            store.end_upload(upload.id, upload.id.0, Some(outcome)).await.unwrap();
         }
     }
     assert_eq!(usage().await, Usage { bytes: 110, announced_bytes: 7, plants: 2, own });
