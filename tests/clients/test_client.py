@@ -126,9 +126,11 @@ class ClientTest(unittest.TestCase):
             return status, told.getvalue()
 
         here = ("--plant", "Sunfield", "--survey", "June")
+        target = self.folder / "plant.geojson"
+        status, told = run("upload", "map", str(survey), *here, "--out", str(target))
+        self.assertEqual((status, "read" in told, "stored" in told), (1, True, False), told)
         self.assertEqual(run("upload", "upload", str(survey), *here)[0], 0)
         self.assertEqual(run("upload", "start", *here)[0], 0)
-        target = self.folder / "plant.geojson"
         for name, why in (("Sunfield", "model_not_found"), ("Sunfeld", "no plant of the name"), ("Sunfield North", "no plant")):
             status, told = run("read", "fetch", "--plant", name, "--out", str(target))
             self.assertEqual((status, why in told), (1, True), told)

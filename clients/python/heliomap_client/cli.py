@@ -109,9 +109,11 @@ def _fetch(client: Client, args: argparse.Namespace) -> int:
 
 
 def _map(client: Client, args: argparse.Namespace) -> int:
+    plant, survey = _survey(client, args, make=True)
+    # A key that may not read hears so before the work and not after it.
+    client.call("GET", f"/api/v1/plants/{plant}/models?limit=1")
     if _upload(client, args):
         return 1
-    plant, survey = _survey(client, args)
     job = client.follow(plant, client.start_job(plant, survey)["id"], _tell_job)
     if job["state"] != "succeeded":
         return 1
