@@ -16,11 +16,20 @@ use jiff::Timestamp;
 use std::time::{Duration, Instant};
 
 /// How long whoever deletes bytes may take before another does it.
-const LEASE: Duration = Duration::from_secs(300);
+const LEASE: Duration = Duration::from_secs(60);
 /// Blobs of a plant, and plants, that are taken at once.
 const AT_ONCE: u32 = 100;
 
-/// Deletes the bytes that have been unused since before a time; how many blobs that were.
+/// Deletes the bytes that others had begun to delete, and did not come to the end of.
+///
+/// # Errors
+/// A store that does not answer.
+pub async fn free_abandoned(store: &dyn Store, blobs: &Blobs) -> Result<usize, StoreError> {
+    free_unused(store, blobs, Timestamp::MIN).await
+}
+
+/// Deletes the bytes that have been unused since before a time, or that were to be deleted by somebody who fell silent; how
+/// many blobs that were.
 ///
 /// # Errors
 /// A store that does not answer. What is left is deleted the next time.
@@ -34,10 +43,11 @@ pub async fn free_unused(store: &dyn Store, blobs: &Blobs, before: Timestamp) ->
         }
         for unused in taken {
             // Whoever was slow, or asleep, may not be the only one any more.
-            if begun.elapsed() > LEASE / 2 {
+            if begun.elapsed() > LEASE / 4 {
                 return Ok(freed);
             }
-            blobs.delete(unused.blob.plant, unused.blob.sha256).await?;
+            let deleted = tokio::time::timeout(LEASE / 4, blobs.delete(unused.blob.plant, unused.blob.sha256));
+            deleted.await.unwrap_or(Err(StoreError::Silent))?;
             freed += usize::from(store.blob_is_gone(&unused).await?);
         }
     }

@@ -105,13 +105,15 @@ macro_rules! needed_by_no_job {
 pub const UNNAME_BLOB: &str =
     concat!("UPDATE blobs SET unused_ms = $3 WHERE plant_id = $1 AND sha256 = $2 AND ", unnamed!());
 pub const PLANTS_WITH_UNUSED_BLOBS: &str = concat!(
-    "SELECT DISTINCT plant_id AS id FROM blobs WHERE unused_ms < $1 AND (freeing_ms IS NULL OR freeing_ms < $2) AND ",
+    "SELECT DISTINCT plant_id AS id FROM blobs WHERE unused_ms IS NOT NULL \
+     AND ((freeing_ms IS NULL AND unused_ms < $1) OR freeing_ms < $2) AND ",
     needed_by_no_job!(),
     " ORDER BY plant_id LIMIT $3"
 );
 pub const TAKE_UNUSED_BLOBS: &str = concat!(
     "UPDATE blobs SET freeing_ms = $5 WHERE plant_id = $1 AND sha256 IN (SELECT blobs.sha256 FROM blobs \
-     WHERE plant_id = $1 AND unused_ms < $2 AND (freeing_ms IS NULL OR freeing_ms < $3) AND ",
+     WHERE plant_id = $1 AND unused_ms IS NOT NULL \
+     AND ((freeing_ms IS NULL AND unused_ms < $2) OR freeing_ms < $3) AND ",
     unnamed!(),
     " AND ",
     needed_by_no_job!(),

@@ -91,6 +91,21 @@ async fn that_are_just_being_deleted_come_anew() {
     assert_eq!((keeps(&app, &survey, &old), kept_bytes(&app).await), (true, old.len() + new.len()));
 }
 
+/// Whoever was to delete them died: the next upload of the same bytes does not wait for anybody else to notice.
+#[tokio::test]
+async fn whose_deletion_was_abandoned_come_anew() {
+    let app = App::new(&[]).await;
+    let survey = app.survey().await;
+    let [old, new] = [8, 9].map(|width| jpeg(width, 8));
+    put(&app, &survey, "a.jpg", &old).await;
+    put(&app, &survey, "a.jpg", &new).await;
+    let (begun, lease) = (Timestamp::now() - SignedDuration::from_secs(90), Duration::from_secs(60));
+    let before = Timestamp::now() + SignedDuration::from_secs(1);
+    assert_eq!(app.store.take_unused_blobs(before, lease, 10, begun).await.unwrap().len(), 1);
+    put(&app, &survey, "b.jpg", &old).await;
+    assert_eq!((keeps(&app, &survey, &old), kept_bytes(&app).await), (true, old.len() + new.len()));
+}
+
 /// Clients send the same few photos over each other while whatever nothing names is deleted at once: what the surveys name is
 /// there, and nothing else.
 #[tokio::test]

@@ -10,6 +10,7 @@ use super::conditional;
 use super::error::{ApiError, Code};
 use super::state::AppState;
 use crate::plant::PlantId;
+use crate::store::freeing::free_abandoned;
 use crate::store::{
     Content, Digest, FileKind, FileRecord, FileWritten, StagedFile, StoreError, SurveyId, SurveyPath, Wanted,
 };
@@ -107,9 +108,14 @@ pub async fn store(
 
 /// Counts bytes that are about to be stored.
 async fn reserve(state: &AppState, plant: PlantId, blobs: &[(Digest, u64)]) -> Result<(), StoreError> {
-    let begun = Instant::now();
+    let (begun, mut helped) = (Instant::now(), false);
     loop {
         match state.store.reserve_bytes(plant, blobs, state.limits.quotas(), Timestamp::now()).await {
+            Err(StoreError::BeingFreed { .. }) if !helped => {
+                // Whoever deletes them may be dead.
+                helped = true;
+                free_abandoned(&*state.store, &state.blobs).await?;
+            }
             Err(StoreError::BeingFreed { .. }) if begun.elapsed() < WAIT_FOR_FREEING => {
                 tokio::time::sleep(LOOK_EVERY).await;
             }
