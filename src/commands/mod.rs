@@ -97,14 +97,18 @@ async fn forget_what_is_over(store: &dyn Store, blobs: &Blobs) -> Result<(), Sto
 /// As [`open_storage`], for commands beside a service: a database that the service has not brought up to date is left as
 /// it is.
 async fn open_storage_beside(args: &StorageArgs) -> anyhow::Result<(Arc<dyn Store>, Blobs)> {
+    only_of_this_version(schema_of(args).await?)?;
+    open_storage(args).await
+}
+
+/// How the database of a data folder stands, or the one beside it.
+async fn schema_of(args: &StorageArgs) -> anyhow::Result<Schema> {
     let rows = args.data_dir.join(ROWS);
-    let schema = match &args.database {
+    Ok(match &args.database {
         Some(url) => PostgresStore::examine(url).await.context("cannot use the database of --database")?.schema,
         None if rows.is_file() => SqliteStore::examine(&rows).await.with_context(|| unusable(&args.data_dir))?.schema,
         None => Schema::Absent,
-    };
-    only_of_this_version(schema)?;
-    open_storage(args).await
+    })
 }
 
 /// Refuses a database to which an older or a newer version of the program belongs.
@@ -120,14 +124,10 @@ fn only_of_this_version(schema: Schema) -> anyhow::Result<()> {
 
 /// As [`open_storage_beside`], for commands that make nothing new: where no service has been, that is told.
 async fn open_storage_there(args: &StorageArgs) -> anyhow::Result<(Arc<dyn Store>, Blobs)> {
-    let folder = &args.data_dir;
+    let (folder, schema) = (&args.data_dir, schema_of(args).await?);
     match &args.database {
-        Some(url) => {
-            let examined = PostgresStore::examine(url).await.context("cannot use the database of --database")?;
-            ensure!(
-                examined.schema != Schema::Absent,
-                "the database of --database is empty: no service has used it yet"
-            );
+        Some(_) => {
+            ensure!(schema != Schema::Absent, "the database of --database is empty: no service has used it yet");
             ensure!(
                 args.blobs.is_some() || folder.is_dir(),
                 "there is no folder {}: name the service's data folder with --data-dir",
@@ -139,7 +139,8 @@ async fn open_storage_there(args: &StorageArgs) -> anyhow::Result<(Arc<dyn Store
             ensure!(rows.is_file(), "there is no {}: name the service's data folder with --data-dir", rows.display());
         }
     }
-    open_storage_beside(args).await
+    only_of_this_version(schema)?;
+    open_storage(args).await
 }
 
 /// The pipeline, its detector opened. Where that fails, whoever named models or a runtime must hear of it; a service without

@@ -143,8 +143,8 @@ impl Watch {
     pub fn begin(&self, fingerprint: String, known: Vec<Checkpoint>, last: Option<Pace>) {
         let (mut parts, images): (Vec<_>, Vec<_>) =
             known.into_iter().partition(|kept| kept.name.starts_with(STRUCTURE));
-        let images = images.into_iter();
         let known = images
+            .into_iter()
             // One that cannot be read is found again.
             .filter_map(|kept| Some((kept.name, ciborium::from_reader(kept.document.as_slice()).ok()?)))
             .collect();

@@ -8,7 +8,7 @@ use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::post;
 use heliomap::config::Limits;
-use heliomap::store::SigningSecret;
+use heliomap::store::{Created, Enqueued, JobRequest, NewWebhook, Quotas, SigningSecret};
 use heliomap::telemetry::Metrics;
 use heliomap::webhooks::{HEADER, Sender, SenderSettings, Targets, verify};
 use jiff::{SignedDuration, Timestamp};
@@ -189,4 +189,47 @@ async fn messages_go_to_public_addresses_alone() {
     app.map(&survey).await;
     let dead = delivery_in(&app, &webhook, "dead").await;
     assert_eq!(dead["error"], "localhost leads to no public address", "{dead}");
+}
+
+/// Receivers of one organisation that take connections and answer nothing hold up its own messages alone.
+#[tokio::test]
+async fn slow_receivers_of_one_organisation_keep_no_other_waiting() {
+    let app = App::new(&[]).await;
+    let now = Timestamp::now();
+    let silent = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let slow = format!("http://{}/", silent.local_addr().unwrap());
+    let held = Arc::new(Mutex::new(Vec::new()));
+    let holding = held.clone();
+    tokio::spawn(async move {
+        while let Ok((line, _)) = silent.accept().await {
+            holding.lock().unwrap().push(line);
+        }
+    });
+    let (receiver, quick) = Receiver::new(&[]).await;
+    for (name, url, webhooks) in [("slow", &slow, 40), ("quick", &quick, 1)] {
+        let (Created::New(organisation) | Created::Existing(organisation)) =
+            app.store.create_organisation(name, now).await.unwrap();
+        let (Created::New(plant) | Created::Existing(plant)) =
+            app.store.create_plant(organisation.id, "A", Quotas::default(), now).await.unwrap();
+        for _ in 0..webhooks {
+            let secret = SigningSecret::random().unwrap();
+            let new = NewWebhook { organisation: organisation.id, plant: None, url: url.clone(), secret };
+            app.store.create_webhook(&new, now).await.unwrap().unwrap();
+        }
+        let (Created::New(survey) | Created::Existing(survey)) =
+            app.store.create_survey(plant.id, "June", now).await.unwrap();
+        let (options, survey) = ("{}".to_owned(), survey.id);
+        let request = JobRequest { plant: plant.id, survey, options, priority: 0, max_attempts: 1 };
+        let (Enqueued::New(job) | Enqueued::Existing(job)) = app.store.enqueue_job(&request, now).await.unwrap();
+        app.store.cancel_job(plant.id, job.id, now).await.unwrap();
+    }
+    let _sending = sender(&app, Targets::Any, Metrics::default());
+    let arrives = async {
+        while receiver.came().is_empty() {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    };
+    // Far less than the sender waits for a slow one.
+    tokio::time::timeout(Duration::from_secs(5), arrives).await.expect("it waits for no other's receivers");
+    assert!(held.lock().unwrap().len() <= 2);
 }

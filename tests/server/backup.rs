@@ -293,12 +293,7 @@ fn postgres_and_a_bucket_are_restored_by_their_own_tools() {
     for database in [&first, &second] {
         tool("createdb", &["--maintenance-db", &format!("{server}/postgres"), database]);
     }
-    let env = [
-        ("AWS_ENDPOINT_URL", endpoint.as_str()),
-        ("AWS_REGION", "eu-central-1"),
-        ("AWS_ACCESS_KEY_ID", "heliomap"),
-        ("AWS_SECRET_ACCESS_KEY", "heliomap"),
-    ];
+    let env = super::bucket_at(&endpoint);
     let store = |database: &str| {
         [
             "--database".to_owned(),

@@ -85,6 +85,16 @@ fn listening(command: Command, log: impl Into<Stdio>) -> (Program, String) {
     (program, base.to_owned())
 }
 
+/// How the program reaches the tests' S3-compatible server.
+fn bucket_at(endpoint: &str) -> [(&str, &str); 4] {
+    [
+        ("AWS_ENDPOINT_URL", endpoint),
+        ("AWS_REGION", "eu-central-1"),
+        ("AWS_ACCESS_KEY_ID", "heliomap"),
+        ("AWS_SECRET_ACCESS_KEY", "heliomap"),
+    ]
+}
+
 fn jpeg() -> Vec<u8> {
     jpeg_of(16)
 }

@@ -92,8 +92,7 @@ fn an_upload_goes_on_at_whichever_server_is_there() {
                 &format!("s3://heliomap-tests/{prefix}"),
             ])
             .env("HELIOMAP_DATA_DIR", place.path().join(server))
-            .envs([("AWS_ENDPOINT_URL", endpoint.as_str()), ("AWS_REGION", "eu-central-1")])
-            .envs([("AWS_ACCESS_KEY_ID", "heliomap"), ("AWS_SECRET_ACCESS_KEY", "heliomap")]);
+            .envs(super::bucket_at(&endpoint));
         super::listening(command, Stdio::null())
     };
     let client = client();
