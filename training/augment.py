@@ -108,16 +108,7 @@ def photometric(image: np.ndarray, rng: Rng, strength: float = 1.0) -> np.ndarra
         x = (x - 0.5) * np.float32(np.exp(rng.normal(0, 0.15))) + 0.5 + np.float32(rng.normal(0, 0.06))
     if rng.random() < 0.12:  # a dark, flat exposure
         x = x * np.float32(rng.uniform(0.25, 0.7)) + np.float32(rng.uniform(0.0, 0.12))
-    if rng.random() < 0.35:
-        s = rng.uniform(0.3, 1.3)
-        x = cv2.GaussianBlur(x, (0, 0), s)
-    elif rng.random() < 0.1:
-        n = int(rng.integers(2, 5))
-        k = np.zeros((5, 5), np.float32)
-        a = rng.uniform(0, np.pi)
-        for t in np.linspace(-n / 2, n / 2, 9):
-            k[int(round(2 + t / 2 * np.sin(a))), int(round(2 + t / 2 * np.cos(a)))] = 1
-        x = cv2.filter2D(x, -1, k / k.sum())
+    x = blur(x, rng)
     if rng.random() < 0.25:  # sharpening halos of drone cameras
         b = cv2.GaussianBlur(x, (0, 0), rng.uniform(0.6, 1.5))
         x = x + (x - b) * np.float32(rng.uniform(0.2, 1.2))
@@ -134,6 +125,23 @@ def photometric(image: np.ndarray, rng: Rng, strength: float = 1.0) -> np.ndarra
     if rng.random() < 0.03:
         out = np.repeat(out.mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8)
     return out
+
+
+def blur(x: np.ndarray, rng: Rng) -> np.ndarray:
+    """Out of focus, or moved while the shutter was open; mostly neither."""
+    r = rng.random()
+    if r < 0.35:
+        return cv2.GaussianBlur(x, (0, 0), rng.uniform(0.3, 1.3) if rng.random() < 0.75 else rng.uniform(1.3, 2.3))
+    if r < 0.52:
+        length = rng.uniform(2, 5) if rng.random() < 0.6 else rng.uniform(5, 9)
+        k = np.zeros((11, 11), np.float32)
+        a = rng.uniform(0, np.pi)
+        tip = np.array([np.cos(a), np.sin(a)]) * length / 2
+        ends = (np.array([5 - tip, 5 + tip]) * 16).round().astype(int).tolist()
+        cv2.line(k, ends[0], ends[1], 1.0, 1, cv2.LINE_8, 4)
+        k += k[::-1, ::-1]  # about the middle: what is blurred does not move
+        return cv2.filter2D(x, -1, k / k.sum())
+    return x
 
 
 def blob(x: np.ndarray, rng: Rng) -> np.ndarray:

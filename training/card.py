@@ -42,10 +42,14 @@ Metadata of the file (`heliomap.*`) says the same to programs. From the outputs 
 |---|---|---|
 | rendered plants `train/00` to `09`, `14` to `59` but nine of these, 141 photos | training | ours, CC0 |
 | rendered plants {validation}, 27 photos | validation: thresholds were chosen there | ours, CC0 |
-| drawn pictures, endless (`training/draw.py`) | training | ours |
+| drawn pictures, endless (`training/draw/`) | training | ours |
 | `real-labelled`: four of five hand-labelled frames of one real plant | training | MIT, as its source states |
+| `real-solarseg`: the first of two orthophoto tiles of a real plant | training | MIT, as its source states |
 {own}| rendered plants `train/10` to `13`, `example` | test | ours, CC0 |
 | `real-labelled/tsukuba_vegetation` | test (same plant as the four above, another frame) | MIT, as its source states |
+| `real-solarseg`: the second tile | test (same plant as the first) | MIT, as its source states |
+| `flight-halfcut`: a rendered flight over half-cut modules with black frames | test | ours, CC0 |
+| `real-halfcut`: eight frames of real roofs with half-cut modules, labels in `training/labels` | validation | photos: no licence stated, not shipped, never trained on; labels: ours |
 | `missouri-west`, 21 frames of the northernmost flight line, labels in `training/labels` | test | photos: no licence stated, not shipped; labels: ours |
 
 No photo of any of these is in the repository. The example is rendered like the training plants, but no photo of it was

@@ -26,6 +26,7 @@ from .targets import CORE_SHRINK, GSD, GSD_RANGE
 
 FACE_T, ERODE = 0.99, 1  # of the comparison by morphology: what does best on the validation plants
 GLARE_LEVEL = 240  # of all three channels
+MODULE_PX = 24.0  # short side of a module to which photos are scaled that have no camera
 
 # Conditions of a rendered plant by which the validation is told apart.
 CONDITIONS = {
@@ -243,7 +244,12 @@ def test_sets() -> dict[str, list[tuple[Photo, float]]]:
     west = sources.west_test()
     if west:
         sets["missouri-west, northern line"] = [(p, 1.0) for p in west]
-    return sets
+    sets["real-solarseg, second tile, 1/2"] = [(p, 0.5) for p in sources.orthophotos(test=True)]
+    sets["flight-halfcut"] = [(p, working_scale(p.gsd)) for p in sources.halfcut_flight()]
+    # For validation, not for tests. No camera tells the scale: modules are brought to MODULE_PX.
+    for p in sources.halfcut_roofs():
+        sets[f"real-halfcut (validation), {Path(p.name).stem}"] = [(p, MODULE_PX / p.module_px)]
+    return {name: photos for name, photos in sets.items() if photos}
 
 
 def speed(runner: Runner) -> float:

@@ -1,7 +1,7 @@
 """Photos with polygons: rendered plants, hand-labelled real frames, self-labelled frames.
 
 The data folder is named by the environment variable HELIOMAP_DATA and holds `example/`, `train/`,
-`real-labelled/` and `missouri-west/`.
+`real-labelled/`, `missouri-west/` and `real-solarseg/`.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 TEST_PLANTS = ("10", "11", "12", "13")
 VALIDATION_PLANTS = ("18", "23", "26", "33", "34", "39", "44", "46", "54")
 TEST_FRAMES = ("tsukuba_vegetation.jpg",)
+ORTHOPHOTOS = ("solarseg_1.jpg",)  # the other tile is for tests
 
 
 @dataclass
@@ -120,6 +121,28 @@ def real_frames(test: bool) -> list[Photo]:
     held = {Path(n).stem for n in TEST_FRAMES}
     names = [n for n in sorted(labels) if (Path(n).stem in held) == test]
     return load_labelled(folder, labels, names)
+
+
+def own_labels(name: str) -> list[Photo]:
+    """The photos of a folder of the data that is there, with the labels kept in this folder."""
+    root = data_root() / name
+    labels = json.loads((Path(__file__).with_name("labels") / f"{name}.json").read_text())
+    return load_labelled(root, labels, [n for n in sorted(labels) if (root / n).exists()])
+
+
+def orthophotos(test: bool) -> list[Photo]:
+    return [p for p in own_labels("real-solarseg") if (Path(p.name).name in ORTHOPHOTOS) != test]
+
+
+def halfcut_roofs() -> list[Photo]:
+    """Real roofs of half-cut modules, for validation alone."""
+    return own_labels("real-halfcut")
+
+
+def halfcut_flight() -> list[Photo]:
+    """A rendered flight over half-cut modules with black frames, for tests alone."""
+    folder = data_root() / "flight-halfcut"
+    return load_render(folder) if (folder / "truth.json").exists() else []
 
 
 def render_folders(part: str) -> list[Path]:

@@ -53,8 +53,8 @@ def arguments() -> argparse.Namespace:
     p.add_argument("--seed", type=int, default=7)
     p.add_argument("--threads", type=int, default=2)
     p.add_argument("--workers", type=int, default=1)
-    p.add_argument("--renders", type=float, default=0.40, help="share of crops of rendered plants")
-    p.add_argument("--real", type=float, default=0.18, help="share of crops of hand-labelled real frames")
+    p.add_argument("--renders", type=float, default=0.30, help="share of crops of rendered plants")
+    p.add_argument("--real", type=float, default=0.11, help="share of crops of hand-labelled real frames and orthophotos")
     p.add_argument("--self", dest="own", type=float, default=0.0, help="share of crops of self-labelled frames")
     p.add_argument("--self-labels", help="labels file of the self-labelled frames (training.bootstrap)")
     p.add_argument("--init", type=Path, help="start from the averaged weights of this checkpoint, of either kind: what both share")
@@ -68,6 +68,66 @@ def schedule(step: int, done: float) -> float:
     return warm * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * min(1.0, done))))
 
 
+class Run:
+    """The network, the running average of its weights (what is exported), its optimiser, and how far training is."""
+
+    def __init__(self, a: argparse.Namespace, device: torch.device):
+        self.args, self.path = a, a.out / "checkpoint.pt"
+        net_of = KINDS[a.kind][0]
+        self.net = net_of(WIDTHS).to(device, memory_format=torch.channels_last)
+        self.mean = net_of(WIDTHS).to(device)
+        self.opt = torch.optim.AdamW(self.net.parameters(), lr=a.lr, weight_decay=1e-3)
+        self.step, self.before, self.begun = 0, 0.0, time.time()  # steps, seconds of earlier runs, start of this one
+        if self.path.exists():
+            state = torch.load(self.path, map_location=device, weights_only=True)
+            self.net.load_state_dict(state["net"])
+            self.mean.load_state_dict(state["mean"])
+            self.opt.load_state_dict(state["opt"])
+            self.step, self.before = state["step"], state.get("seconds", 0.0)
+            print(f"resumed at step {self.step}", flush=True)
+            return
+        if a.init:
+            state = torch.load(a.init, map_location=device, weights_only=True)
+            self.net.load_state_dict(state["mean"], strict=False)
+        self.mean.load_state_dict(self.net.state_dict())
+
+    @property
+    def seconds(self) -> float:
+        return self.before + time.time() - self.begun
+
+    def save(self) -> None:
+        state = {"kind": self.args.kind, "net": self.net.state_dict(), "mean": self.mean.state_dict(), "opt": self.opt.state_dict()}
+        state |= {"step": self.step, "widths": WIDTHS, "seconds": self.seconds}
+        torch.save(state, self.path.with_suffix(".tmp"))
+        os.replace(self.path.with_suffix(".tmp"), self.path)
+
+    def learn(self, value: torch.Tensor) -> None:
+        """One step down the loss."""
+        self.opt.zero_grad(set_to_none=True)
+        value.backward()
+        torch.nn.utils.clip_grad_norm_(self.net.parameters(), 2.0)
+        self.opt.step()
+        self.step += 1
+        with torch.no_grad():
+            k = min(0.995, self.step / (self.step + 10))
+            for m, n in zip(self.mean.state_dict().values(), self.net.state_dict().values()):
+                if m.dtype.is_floating_point:
+                    m.lerp_(n, 1 - k)
+                else:
+                    m.copy_(n)
+
+
+def mixture(a: argparse.Namespace) -> list[tuple[float, list[sources.Photo]]]:
+    """Photos with their shares; the rest is drawn."""
+    mix = [
+        (a.renders, sources.renders("train")),
+        (a.real, sources.real_frames(test=False) + sources.orthophotos(test=False)),
+        (a.own, sources.self_labelled(a.self_labels)),
+    ]
+    print("photos:", [len(p) for _, p in mix], flush=True)
+    return mix
+
+
 def main() -> None:
     a = arguments()
     a.out.mkdir(parents=True, exist_ok=True)
@@ -75,31 +135,8 @@ def main() -> None:
     torch.set_num_threads(a.threads)
     cv2.setNumThreads(0)  # OpenCV's thread pool does not survive the fork of the loader's processes
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    Net, make_targets, loss_fn = KINDS[a.kind]
-    net = Net(WIDTHS).to(device, memory_format=torch.channels_last)
-    mean = Net(WIDTHS).to(device)  # running average of the weights: what is exported
-    opt = torch.optim.AdamW(net.parameters(), lr=a.lr, weight_decay=1e-3)
-    step, before = 0, 0.0  # steps and seconds of earlier runs
-    path = a.out / "checkpoint.pt"
-    if path.exists():
-        state = torch.load(path, map_location=device, weights_only=True)
-        net.load_state_dict(state["net"])
-        mean.load_state_dict(state["mean"])
-        opt.load_state_dict(state["opt"])
-        step, before = state["step"], state.get("seconds", 0.0)
-        print(f"resumed at step {step}", flush=True)
-    elif a.init:
-        state = torch.load(a.init, map_location=device, weights_only=True)
-        net.load_state_dict(state["mean"], strict=False)
-    if not path.exists():
-        mean.load_state_dict(net.state_dict())
-
-    def save() -> None:
-        state = {"kind": a.kind, "net": net.state_dict(), "mean": mean.state_dict(), "opt": opt.state_dict(), "step": step, "widths": WIDTHS}
-        state["seconds"] = before + time.time() - begun
-        torch.save(state, path.with_suffix(".tmp"))
-        os.replace(path.with_suffix(".tmp"), path)
-
+    _, make_targets, loss_fn = KINDS[a.kind]
+    run = Run(a, device)
     stop = False
 
     def on_signal(*_: object) -> None:
@@ -108,53 +145,35 @@ def main() -> None:
 
     signal.signal(signal.SIGTERM, on_signal)
     signal.signal(signal.SIGINT, on_signal)
-
-    mix = [
-        (a.renders, sources.renders("train")),
-        (a.real, sources.real_frames(test=False)),
-        (a.own, sources.self_labelled(a.self_labels)),
-    ]
-    print("photos:", [len(p) for _, p in mix], flush=True)
-    stream = Stream(mix, a.size, a.seed, start=step * a.batch, targets=make_targets)
+    stream = Stream(mixture(a), a.size, a.seed, start=run.step * a.batch, targets=make_targets)
     loader = iter(DataLoader(stream, a.batch, num_workers=a.workers, prefetch_factor=6 if a.workers else None))
-    net.train()
-    begun = saved = time.time()
-    average, first = 0.0, step
-    while step < a.steps and not stop:
-        over = (before + time.time() - begun) / (a.minutes * 60) if a.minutes else 0.0
+    run.net.train()
+    run.begun = saved = time.time()
+    average, first = 0.0, run.step
+    while run.step < a.steps and not stop:
+        over = run.seconds / (a.minutes * 60) if a.minutes else 0.0
         if over >= 1.0:
             break
-        for g in opt.param_groups:
-            g["lr"] = a.lr * schedule(step, max(step / a.steps, over))
+        for g in run.opt.param_groups:
+            g["lr"] = a.lr * schedule(run.step, max(run.step / a.steps, over))
         x, *wanted = (t.to(device) for t in next(loader))
         x = x.contiguous(memory_format=torch.channels_last)
         with torch.autocast(device.type, torch.bfloat16):
-            raw = net(x)
+            raw = run.net(x)
         value = loss_fn(raw, *wanted)
-        opt.zero_grad(set_to_none=True)
-        value.backward()
-        torch.nn.utils.clip_grad_norm_(net.parameters(), 2.0)
-        opt.step()
-        step += 1
-        with torch.no_grad():
-            k = min(0.995, step / (step + 10))
-            for m, n in zip(mean.state_dict().values(), net.state_dict().values()):
-                if m.dtype.is_floating_point:
-                    m.lerp_(n, 1 - k)
-                else:
-                    m.copy_(n)
+        run.learn(value)
         average = value.item() if average == 0 else 0.98 * average + 0.02 * value.item()
         now = time.time()
-        if step % 50 == 0:
-            pace = (now - begun) / (step - first)
-            print(f"step {step} loss {average:.4f} {pace:.2f} s/step", flush=True)
+        if run.step % 50 == 0:
+            pace = (now - run.begun) / (run.step - first)
+            print(f"step {run.step} loss {average:.4f} {pace:.2f} s/step", flush=True)
             with open(a.out / "log.jsonl", "a") as f:
-                f.write(json.dumps({"step": step, "loss": round(average, 5), "s_per_step": round(pace, 3)}) + "\n")
+                f.write(json.dumps({"step": run.step, "loss": round(average, 5), "s_per_step": round(pace, 3)}) + "\n")
         if now - saved > a.save_every:
-            save()
+            run.save()
             saved = now
-    save()
-    print(f"stopped at step {step}", flush=True)
+    run.save()
+    print(f"stopped at step {run.step}", flush=True)
 
 
 if __name__ == "__main__":
