@@ -7,7 +7,7 @@ import numpy as np
 from ..augment import Rng
 from .patterns import log_uniform, rgb
 
-KINDS = {"poly": 0.2, "mono": 0.15, "black": 0.07, "thin": 0.12, "halfcut": 0.38, "shingle": 0.08}
+KINDS = {"poly": 0.16, "mono": 0.1, "black": 0.06, "thin": 0.1, "halfcut": 0.51, "shingle": 0.07}
 
 # Width and length in metres of modules with half-cut cells as they are sold, the common ones twice.
 HALFCUT_SIZES = [
@@ -157,10 +157,10 @@ class Style:
         self.half_broken = rng.random() < 0.15
         # Seams against gaps: as bright, brighter, or dark between black frames.
         r = rng.random()
-        if r < 0.35:
+        if r < 0.45:
             self.seam_color = [self.half_color * rng.uniform(0.75, 1.1) for _ in range(2)]
             self.frame_color, self.frame = self.half_color * rng.uniform(0.75, 1.1), rng.uniform(0.004, 0.02)
-        elif r < 0.65:
+        elif r < 0.7:
             self.frame_color, self.frame = BLACK * rng.uniform(0.6, 2.2), rng.uniform(0.008, 0.03)
             self.seam_color = [BLACK * rng.uniform(0.5, 2) for _ in range(2)]
         self.seam = (rng.uniform(0.004, 0.028), rng.uniform(0.004, 0.028))
