@@ -66,7 +66,13 @@ class Canvas:
 
     def shadow(self, polygons) -> None:
         """Darkens polygons (pixels)."""
-        self.shade(poly_mask(self.n, polygons, self.rng.uniform(0.0, 2.5) * UP))
+        blur = self.rng.uniform(0.0, 2.5) * UP
+        found = self.window(np.concatenate(polygons), 2 + int(3 * blur)) if len(polygons) else None
+        if found is None:
+            return
+        view, lo = found
+        m = poly_mask(max(view.shape[:2]), [p - lo for p in polygons], blur)[: view.shape[0], : view.shape[1], None]
+        view *= 1 - m * (1 - self.dark * self.sky)
 
     def window(self, points: np.ndarray, margin: int = 2):
         """The part of the picture about points: the view and its upper left corner; None where there is none."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from ..augment import Rng, noise_field
@@ -38,6 +39,10 @@ def surface(rng: Rng, n: int, gsd: float) -> np.ndarray:
 
 def ground(rng: Rng, n: int, gsd: float) -> np.ndarray:
     """One surface, or two in patches (n, n, 3)."""
+    return cv2.resize(coarse(rng, n // 2, 2 * gsd), (n, n), interpolation=cv2.INTER_LINEAR)
+
+
+def coarse(rng: Rng, n: int, gsd: float) -> np.ndarray:
     x = surface(rng, n, gsd)
     if rng.random() < 0.6:
         mask = noise_field(rng, n, rng.uniform(3, 20) / gsd) + rng.normal(0, 0.6)

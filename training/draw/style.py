@@ -49,7 +49,7 @@ class Style:
         if self.kind in ("thin", "shingle") and rng.random() < 0.5:
             self.hide_seams(rng)
         self.sheen = rng.uniform(-0.5, 0.7)
-        self.glare = 0.4 if rng.random() < 0.25 else 0.0
+        self.glare = 0.4 if rng.random() < 0.15 else 0.0
 
     def shape(self, rng: Rng) -> None:
         """Size and number of cells. No module is nearly square, but halves of modules are."""
