@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -229,27 +230,29 @@ def validation(runner: Runner, find=detect) -> dict[str, dict]:
     return {name: sums[name].row() for name in sorted(sums)}
 
 
-def test_sets() -> dict[str, list[tuple[Photo, float]]]:
-    """Name of the set to its photos and the scale at which each is run."""
-    sets: dict[str, list[tuple[Photo, float]]] = {}
-    for folder in sources.render_folders("test"):
-        sets[f"train/{folder.name}"] = [(p, working_scale(p.gsd)) for p in sources.load_render(folder)]
+def scaled(photos: list[Photo], scale: float | None = None) -> list[tuple[Photo, float]]:
+    """Photos with the scale at which each is run: the given one, or that of the working distance."""
+    return [(p, working_scale(p.gsd) if scale is None else scale) for p in photos]
+
+
+def test_sets() -> dict[str, Callable[[], list[tuple[Photo, float]]]]:
+    """Name of the set to what loads its photos, with the scale at which each is run."""
+    sets = {f"train/{f.name}": lambda f=f: scaled(sources.load_render(f)) for f in sources.render_folders("test")}
     example = sources.data_root() / "example"
     if (example / "truth.json").exists():
-        sets["example"] = [(p, working_scale(p.gsd)) for p in sources.load_render(example)]
+        sets["example"] = lambda: scaled(sources.load_render(example))
     # The real frames are far sharper than the working distance: halved and at a third.
-    held = sources.real_frames(test=True)
-    sets["real held out, 1/2"] = [(p, 0.5) for p in held]
-    sets["real held out, 1/3"] = [(p, 1 / 3) for p in held]
-    west = sources.west_test()
-    if west:
-        sets["missouri-west, northern line"] = [(p, 1.0) for p in west]
-    sets["real-solarseg, second tile, 1/2"] = [(p, 0.5) for p in sources.orthophotos(test=True)]
-    sets["flight-halfcut"] = [(p, working_scale(p.gsd)) for p in sources.halfcut_flight()]
+    sets["real held out, 1/2"] = lambda: scaled(sources.real_frames(test=True), 0.5)
+    sets["real held out, 1/3"] = lambda: scaled(sources.real_frames(test=True), 1 / 3)
+    sets["missouri-west, northern line"] = lambda: scaled(sources.west_test(), 1.0)
+    sets["real-solarseg, second tile, 1/2"] = lambda: scaled(sources.orthophotos(test=True), 0.5)
+    sets["flight-halfcut"] = lambda: scaled(sources.halfcut_flight())
     # For validation, not for tests. No camera tells the scale: modules are brought to MODULE_PX.
-    for p in sources.halfcut_roofs():
-        sets[f"real-halfcut (validation), {Path(p.name).stem}"] = [(p, MODULE_PX / p.module_px)]
-    return {name: photos for name, photos in sets.items() if photos}
+    for name in sources.names_of("real-halfcut"):
+        sets[f"real-halfcut (validation), {Path(name).stem}"] = lambda name=name: [
+            (p, MODULE_PX / p.module_px) for p in sources.own_labels("real-halfcut", [name])
+        ]
+    return sets
 
 
 def speed(runner: Runner) -> float:
@@ -284,8 +287,9 @@ def main() -> None:
         print(f"validation, {name}", json.dumps(row), flush=True)
     if a.validation:
         return
-    for name, photos in test_sets().items():
-        if a.only and a.only not in name:
+    for name, load in test_sets().items():
+        photos = load() if not a.only or a.only in name else []
+        if not photos:
             continue
         total = Score()
         for photo, scale in photos:

@@ -123,20 +123,19 @@ def real_frames(test: bool) -> list[Photo]:
     return load_labelled(folder, labels, names)
 
 
-def own_labels(name: str) -> list[Photo]:
-    """The photos of a folder of the data that is there, with the labels kept in this folder."""
-    root = data_root() / name
-    labels = json.loads((Path(__file__).with_name("labels") / f"{name}.json").read_text())
-    return load_labelled(root, labels, [n for n in sorted(labels) if (root / n).exists()])
+def names_of(folder: str) -> list[str]:
+    """Photos of a folder of the data that are there and have labels kept beside this file."""
+    labels = json.loads((Path(__file__).with_name("labels") / f"{folder}.json").read_text())
+    return [n for n in sorted(labels) if (data_root() / folder / n).exists()]
+
+
+def own_labels(folder: str, names: list[str]) -> list[Photo]:
+    labels = json.loads((Path(__file__).with_name("labels") / f"{folder}.json").read_text())
+    return load_labelled(data_root() / folder, labels, names)
 
 
 def orthophotos(test: bool) -> list[Photo]:
-    return [p for p in own_labels("real-solarseg") if (Path(p.name).name in ORTHOPHOTOS) != test]
-
-
-def halfcut_roofs() -> list[Photo]:
-    """Real roofs of half-cut modules, for validation alone."""
-    return own_labels("real-halfcut")
+    return own_labels("real-solarseg", [n for n in names_of("real-solarseg") if (n in ORTHOPHOTOS) != test])
 
 
 def halfcut_flight() -> list[Photo]:
