@@ -14,7 +14,7 @@ WORKDIR /heliomap
 COPY Makefile ./
 RUN make .ort/libonnxruntime.so
 COPY Cargo.toml Cargo.lock ./
-COPY benches/ benches/
+COPY crates/ crates/
 COPY migrations/ migrations/
 COPY src/ src/
 COPY --from=web /heliomap/web/dist/ web/dist/

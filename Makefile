@@ -14,7 +14,7 @@ ORT_LIBRARY := .ort/libonnxruntime.so
 export ORT_DYLIB_PATH ?= $(abspath $(ORT_LIBRARY))
 
 # Where the data sets lie that are too large for the repository; tests that need one say so when they skip.
-HELIOMAP_DATA ?= $(wildcard ../shared/data)
+HELIOMAP_DATA ?= $(abspath $(wildcard ../shared/data))
 export HELIOMAP_DATA
 
 .PHONY: help setup web demo test lint unit client kills tus contract query load scale-out tenants deploy-lint fuzz structure bench scaling yolo-export openapi configuration clean
@@ -45,11 +45,11 @@ demo: setup ## Map the example plant through the HTTP service and check it (KEEP
 test: lint unit ## Run all tests
 
 lint: setup ## Formatting and lints, warnings are errors
-	$(CARGO) fmt --check
-	$(CARGO) clippy --locked --all-targets -- --deny warnings
+	$(CARGO) fmt --all --check
+	$(CARGO) clippy --locked --workspace --all-targets -- --deny warnings
 
 unit: setup .venv/s3/done ## Tests alone
-	tests/with-postgres.sh tests/with-s3.sh $(CARGO) test --locked
+	tests/with-postgres.sh tests/with-s3.sh $(CARGO) test --locked --workspace
 	$(MAKE) --no-print-directory client
 
 client: setup ## The Python client and every command of docs/API.md against the real service
@@ -129,13 +129,13 @@ fuzz: web .cargo-fuzz/bin/cargo-fuzz ## Fuzz every parser of what comes in, FUZZ
 	@$(CARGO) install cargo-fuzz --version $(CARGO_FUZZ_VERSION) --locked --quiet --root .cargo-fuzz
 
 structure: setup ## Survey of many simulated plants of every kind, on all cores; fails where too few come out exactly
-	$(CARGO) test --release --locked --no-fail-fast --test structure -- --ignored --nocapture --test-threads 1
+	$(CARGO) test --release --locked --no-fail-fast --package heliomap-mapping --test structure -- --ignored --nocapture --test-threads 1
 
 bench: setup ## Benchmarks of layout, locate, fusion and refinement
-	$(CARGO) bench --locked --bench structure
+	$(CARGO) bench --locked --package heliomap-mapping --bench structure
 
 scaling: setup ## Time and memory over the size of the plant, to a million modules, with a plot in target/scaling
-	$(CARGO) bench --locked --bench scaling
+	$(CARGO) bench --locked --package heliomap-mapping --bench scaling
 
 # Of its own, because the package and PyTorch are large. Its licence is AGPL: nothing of it is kept.
 ULTRALYTICS_VERSION := 8.4.190
@@ -146,11 +146,11 @@ yolo-export: setup ## Build and export an untrained network of the YOLOv8-seg fa
 	$(PYTHON) -m venv $(YOLO_CHECK)/venv
 	$(YOLO_CHECK)/venv/bin/pip install --quiet --disable-pip-version-check ultralytics==$(ULTRALYTICS_VERSION) onnx onnxruntime
 	$(CARGO) build --locked
-	cd $(YOLO_CHECK) && YOLO_CONFIG_DIR=. venv/bin/python $(CURDIR)/tests/fixtures/detection/export_yolo.py \
+	cd $(YOLO_CHECK) && YOLO_CONFIG_DIR=. venv/bin/python $(CURDIR)/crates/mapping/tests/fixtures/detection/export_yolo.py \
 	  $(CURDIR)/examples/plant/images/DJI_0001.jpg
 	cd $(YOLO_CHECK) && for model in fixed.onnx dynamic.onnx; do \
 	  $(CURDIR)/target/debug/heliomap detect photo.png --gsd 0.045 --detector $$model --out $$model.json; \
-	  venv/bin/python $(CURDIR)/tests/fixtures/detection/check_yolo.py $$model $$model.json; \
+	  venv/bin/python $(CURDIR)/crates/mapping/tests/fixtures/detection/check_yolo.py $$model $$model.json; \
 	done
 	rm -rf $(YOLO_CHECK)
 

@@ -10,11 +10,11 @@ pub use access::{KeysArgs, KeysCommand, OrganisationsArgs, OrganisationsCommand,
 pub use identity::OidcArgs;
 pub use limits::Limits;
 
-use crate::detection::{self, DetectionError, Detector, ExecutionProvider, RuntimeSettings};
 use crate::store::Bucket;
 use crate::webhooks::Targets;
 use axum::http::HeaderValue;
 use clap::{Args, ValueEnum};
+use heliomap_mapping::detection::{self, DetectionError, Detector, ExecutionProvider, RuntimeSettings};
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::Duration;

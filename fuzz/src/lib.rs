@@ -6,7 +6,7 @@ use axum::http::response::Parts;
 use axum::http::{Request, StatusCode};
 use heliomap::config::Limits;
 use heliomap::http::{AppState, router};
-use heliomap::plant::{Layer, ModuleId, PlantId};
+use heliomap_model::{Layer, ModuleId, PlantId};
 use heliomap::store::{
     Blobs, Completed, Created, Digest, Enqueued, GeoBox, JobRequest, NewFeature, NewLayer, NewModel, OrganisationId,
     Quotas, SqliteStore, Store,

@@ -2,7 +2,7 @@
 
 #![no_main]
 
-use heliomap::reconstruction::{exif, photo};
+use heliomap_mapping::reconstruction::{exif, photo};
 use libfuzzer_sys::fuzz_target;
 
 /// Most pixels of an image: enough for every format's parts, few enough to be quick.

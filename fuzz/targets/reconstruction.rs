@@ -2,7 +2,7 @@
 
 #![no_main]
 
-use heliomap::reconstruction::opensfm;
+use heliomap_mapping::reconstruction::opensfm;
 use libfuzzer_sys::fuzz_target;
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;

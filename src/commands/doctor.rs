@@ -3,11 +3,11 @@
 use super::output::print;
 use super::{ROWS, open_blobs, run_async};
 use heliomap::config::{DoctorArgs, ServeArgs};
-use heliomap::detection::DetectionError;
 use heliomap::oidc::Oidc;
-use heliomap::plant::PlantId;
 use heliomap::store::schema::{Examined, Schema};
 use heliomap::store::{PostgresStore, SqliteStore};
+use heliomap_mapping::detection::DetectionError;
+use heliomap_model::PlantId;
 use image::RgbImage;
 use jiff::{SignedDuration, Timestamp};
 use serde::Serialize;

@@ -5,11 +5,11 @@ use super::output::{Output, prepare_folder, print};
 use anyhow::{Context, bail};
 use clap::Args;
 use heliomap::config::DetectorArgs;
-use heliomap::detection::{Detector, ImageDetections, external};
-use heliomap::evaluation::detection::{DetectionReport, LabelledPhoto, PhotoScore, compare, read_labels};
-use heliomap::geometry::Quad;
-use heliomap::overlay;
-use heliomap::reconstruction::photo::DEFAULT_MAX_PIXELS;
+use heliomap_evaluation::detection::{DetectionReport, LabelledPhoto, PhotoScore, compare, read_labels};
+use heliomap_mapping::detection::{Detector, ImageDetections, external};
+use heliomap_mapping::geometry::Quad;
+use heliomap_mapping::reconstruction::photo::DEFAULT_MAX_PIXELS;
+use heliomap_overlay;
 use std::path::{Path, PathBuf};
 
 /// Measure a detector, or a file of boxes, against labelled photos.

@@ -4,8 +4,8 @@ use super::output::{print, print_once, tell};
 use super::{open_storage_beside, open_storage_there, run_async};
 use anyhow::{Context, bail};
 use heliomap::config::{KeysArgs, KeysCommand};
-use heliomap::plant::PlantId;
 use heliomap::store::{ApiKey, Created, KeyId, NewKey, OrganisationId, Page, Secret, Store, TimeSpan};
+use heliomap_model::PlantId;
 use jiff::{SignedDuration, Timestamp};
 
 /// Runs the command.

@@ -2,10 +2,10 @@
 
 use super::StorageArgs;
 use super::limits::parse_size;
-use crate::plant::PlantId;
 use crate::store::usage::UNLIMITED;
 use crate::store::{KeyId, Scope, name};
 use clap::{Args, Subcommand};
+use heliomap_model::PlantId;
 
 /// `heliomap keys`.
 #[derive(Debug, Clone, Args)]

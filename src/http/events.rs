@@ -4,12 +4,12 @@ use super::AppState;
 use super::error::{ApiError, Problem};
 use super::extract::ApiPath;
 use super::jobs::{JobView, require_job};
-use crate::plant::PlantId;
 use crate::store::{Job, JobId};
 use axum::extract::State;
 use axum::http::{HeaderName, HeaderValue, header};
 use axum::response::sse::{Event, KeepAlive, Sse};
 use futures::Stream;
+use heliomap_model::PlantId;
 use std::convert::Infallible;
 use std::time::Duration;
 

@@ -5,15 +5,15 @@ use super::error::{ApiError, Code, Problem};
 use super::extract::{ApiPath, ApiQuery, Object};
 use super::paging::{List, filtered_list, state_filter};
 use super::surveys::missing_views;
-use crate::pipeline::{MapOptions, Stage};
-use crate::plant::{BenchId, PlantId, Warning};
-use crate::refinement::Control;
 use crate::store::{Cancelled, Enqueued, Job, JobId, JobRequest, JobState, SurveyId};
 use axum::Json;
 use axum::body::Bytes;
 use axum::extract::State;
 use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
+use heliomap_mapping::pipeline::{MapOptions, Stage};
+use heliomap_mapping::refinement::Control;
+use heliomap_model::{BenchId, PlantId, Warning};
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 

@@ -5,10 +5,10 @@ use super::error::{ApiError, Code, Problem};
 use super::extract::{ApiPath, ApiQuery};
 use super::jobs::WarningView;
 use super::paging::{List, PageQuery};
-use crate::plant::{Layer, PlantId};
 use crate::store::{JobId, Model, SurveyId};
 use axum::Json;
 use axum::extract::State;
+use heliomap_model::{Layer, PlantId};
 use jiff::Timestamp;
 use serde::Serialize;
 

@@ -6,12 +6,12 @@ use super::error::{ApiError, Code, Problem};
 use super::extract::{ApiJson, ApiPath, ApiQuery};
 use super::guard::Caller;
 use super::paging::{List, filtered_list, prefix_filter};
-use crate::plant::PlantId;
 use crate::store::{Created, Page, Plant, name};
 use axum::Json;
 use axum::extract::State;
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
+use heliomap_model::PlantId;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 

@@ -8,11 +8,11 @@ use super::images::{self, FileView, ImagesSummary};
 use super::paging::{List, filtered_list, list_limit, next_link, next_part, prefix_filter, with_filters};
 use super::plants::{checked_name, created_answer};
 use crate::jobs;
-use crate::plant::PlantId;
 use crate::store::{Created, FileKind, FileRecord, Survey, SurveyId};
 use axum::Json;
 use axum::extract::State;
 use axum::response::{IntoResponse, Response};
+use heliomap_model::PlantId;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 

@@ -11,7 +11,6 @@ use super::images::FileView;
 use super::intake::archive::{self, ArchiveError, Unpacked};
 use super::intake::receive::{Bounds, drain, receive};
 use super::intake::{self, Stored};
-use crate::plant::PlantId;
 use crate::store::{Content, FileWritten, ImageName, StagedFile, StoreError, SurveyId, SurveyPath};
 use axum::Json;
 use axum::body::{Body, BodyDataStream};
@@ -19,6 +18,7 @@ use axum::extract::multipart::{Field, MultipartError, MultipartRejection};
 use axum::extract::{Multipart, State};
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
+use heliomap_model::PlantId;
 use serde::Serialize;
 use std::time::Duration;
 

@@ -6,13 +6,13 @@ use super::error::{ApiError, Code, Problem};
 use super::extract::{ApiJson, ApiPath, ApiQuery};
 use super::guard::Caller;
 use super::paging::{List, PageQuery, filtered_list, state_filter};
-use crate::plant::PlantId;
 use crate::store::webhooks::MAX_WEBHOOKS;
 use crate::store::{Delivery, DeliveryId, DeliveryState, JobId, NewWebhook, SigningSecret, Webhook, WebhookId};
 use axum::Json;
 use axum::extract::State;
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
+use heliomap_model::PlantId;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 

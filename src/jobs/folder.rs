@@ -2,11 +2,11 @@
 //! when that is done: a job begins before they were fetched, and needs no room for all of them.
 
 use super::AttemptError;
-use crate::plant::PlantId;
-use crate::reconstruction::photo::{Photo, PhotoError, PhotoHeader};
-use crate::reconstruction::{ProjectFolder, ReadError};
 use crate::store::{Blobs, Digest, FileKind, FileRecord, StoreError};
 use futures::{StreamExt, TryStreamExt, stream};
+use heliomap_mapping::reconstruction::photo::{Photo, PhotoError, PhotoHeader};
+use heliomap_mapping::reconstruction::{ProjectFolder, ReadError};
+use heliomap_model::PlantId;
 use image::RgbImage;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};

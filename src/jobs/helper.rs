@@ -1,8 +1,8 @@
 //! A worker without a job of its own helps with the images of those that run.
 
 use super::{AttemptError, Mapper, Worker, share};
-use crate::pipeline::{Found, Loaded, MapError};
 use crate::store::{GivenBack, StoreError, TaskClaim};
+use heliomap_mapping::pipeline::{Found, Loaded, MapError};
 use jiff::Timestamp;
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -1,10 +1,10 @@
 //! What a worker runs.
 
-use crate::detection::{DetectionError, Detector};
-use crate::pipeline::{self, Boxes, Found, Loaded, MapError, MapOptions, Observer, Subject, search};
-use crate::plant::PlantModel;
-use crate::reconstruction::ProjectFolder;
 use crate::store::{Digest, TaskClaim};
+use heliomap_mapping::detection::{DetectionError, Detector};
+use heliomap_mapping::pipeline::{self, Boxes, Found, Loaded, MapError, MapOptions, Observer, Subject, search};
+use heliomap_mapping::reconstruction::ProjectFolder;
+use heliomap_model::PlantModel;
 use std::path::Path;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError, TryLockError};
 

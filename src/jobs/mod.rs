@@ -16,8 +16,8 @@ pub use mapper::{FoundInTask, Mapper, NextTask, PipelineMapper, Stopped};
 pub use readiness::{Missing, RECONSTRUCTIONS, is_shot, missing, shots, shots_without_image};
 pub use worker::{Worker, WorkerSettings};
 
-use crate::pipeline::MapError;
 use crate::store::StoreError;
+use heliomap_mapping::pipeline::MapError;
 
 /// Why an attempt at a job made no model.
 #[derive(Debug, thiserror::Error)]

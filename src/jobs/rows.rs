@@ -1,7 +1,7 @@
 //! A plant model as the store keeps it: layers of features, each with its extent.
 
-use crate::plant::{Layer, PlantModel};
 use crate::store::{GeoBox, NewFeature, NewLayer};
+use heliomap_model::{Layer, PlantModel};
 use serde_json::Value;
 
 /// The layers of a model.

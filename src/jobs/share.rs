@@ -1,8 +1,8 @@
 //! A running job's images, shared with other workers: the side of the worker whose job it is.
 
-use crate::pipeline::{Found, Sought, Turn};
-use crate::plant::PlantId;
 use crate::store::{Claim, Digest, FileRecord, ImageTask, OwnTask, Store, StoreError};
+use heliomap_mapping::pipeline::{Found, Sought, Turn};
+use heliomap_model::PlantId;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use std::collections::{HashMap, VecDeque};

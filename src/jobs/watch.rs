@@ -1,9 +1,9 @@
 //! What the mapping thread and the worker tell each other while a job runs.
 
 use super::share::Share;
-use crate::fusion::Fused;
-use crate::pipeline::{Found, Observer, Sought, Stage, Turn};
 use crate::store::{Checkpoint, Progress};
+use heliomap_mapping::fusion::Fused;
+use heliomap_mapping::pipeline::{Found, Observer, Sought, Stage, Turn};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::io::{Cursor, Read};
@@ -298,9 +298,9 @@ impl Observer for Watch {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::detection::{Detection, ImageDetections, Source};
-    use crate::geometry::Quad;
-    use crate::layout::{self, LayoutOptions};
+    use heliomap_mapping::detection::{Detection, ImageDetections, Source};
+    use heliomap_mapping::geometry::Quad;
+    use heliomap_mapping::layout::{self, LayoutOptions};
     use nalgebra::Vector2;
     use std::time::Duration;
 
@@ -351,7 +351,7 @@ mod tests {
 
     #[test]
     fn a_structure_is_recalled_whole_or_not_at_all() {
-        let bench = |rows| crate::fusion::Doubt {
+        let bench = |rows| heliomap_mapping::fusion::Doubt {
             code: "bench_conflict".into(),
             message: "x".repeat(PART_BYTES / 2),
             images: vec![format!("{rows}.jpg")],

@@ -2,7 +2,7 @@
 
 use super::records::row_id;
 use super::{Created, Digest, Page, StoreError, TimeSpan};
-use crate::plant::PlantId;
+use heliomap_model::PlantId;
 use jiff::Timestamp;
 use std::collections::BTreeSet;
 use std::fmt;

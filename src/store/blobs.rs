@@ -2,8 +2,8 @@
 //! deletes everything of it, and nobody learns from an upload what another plant holds.
 
 use super::{Bucket, StoreError, UploadId, pieces};
-use crate::plant::PlantId;
 use futures::TryStreamExt;
+use heliomap_model::PlantId;
 use object_store::aws::AmazonS3Builder;
 use object_store::buffered::BufWriter;
 use object_store::local::LocalFileSystem;

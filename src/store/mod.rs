@@ -46,7 +46,7 @@ pub use webhooks::{
     WebhookStore,
 };
 
-use crate::plant::{Layer, ModuleId, PlantId};
+use heliomap_model::{Layer, ModuleId, PlantId};
 use jiff::Timestamp;
 use std::time::Duration;
 use tokio::sync::Notify;

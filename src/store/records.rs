@@ -3,8 +3,8 @@
 use super::access::OrganisationId;
 use super::blobs::Digest;
 use super::survey_path::SurveyPath;
-use crate::plant::{Layer, PlantId, Warning};
-use crate::reconstruction::PhotoFacts;
+use heliomap_mapping::reconstruction::PhotoFacts;
+use heliomap_model::{Layer, PlantId, Warning};
 use jiff::Timestamp;
 use std::fmt;
 use std::str::FromStr;

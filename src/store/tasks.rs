@@ -1,7 +1,7 @@
 //! Images of running jobs that other workers may search.
 
 use super::{Checkpoint, Claim, JobId, StoreError};
-use crate::plant::PlantId;
+use heliomap_model::PlantId;
 use jiff::Timestamp;
 use std::time::Duration;
 use uuid::Uuid;

@@ -3,7 +3,7 @@
 use super::records::row_id;
 use super::usage::Quotas;
 use super::{Piece, StoreError, SurveyId};
-use crate::plant::PlantId;
+use heliomap_model::PlantId;
 use jiff::Timestamp;
 use std::fmt;
 use std::time::Duration;

@@ -1,7 +1,7 @@
 //! What an organisation keeps, and what it may keep.
 
 use super::{BlobRecord, Digest, Organisation, OrganisationId, StoreError};
-use crate::plant::PlantId;
+use heliomap_model::PlantId;
 use jiff::Timestamp;
 use std::time::Duration;
 

@@ -2,7 +2,7 @@
 
 use super::records::row_id;
 use super::{Digest, Job, JobId, OrganisationId, Page, StoreError};
-use crate::plant::PlantId;
+use heliomap_model::PlantId;
 use jiff::Timestamp;
 use std::fmt;
 use std::str::FromStr;

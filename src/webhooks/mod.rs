@@ -9,8 +9,8 @@ pub use sender::{Sender, SenderSettings};
 pub use signature::{HEADER, sign, verify};
 pub use target::{TargetError, Targets};
 
-use crate::plant::PlantId;
 use crate::store::{DeliveryClaim, DeliveryId, JobId, SurveyId};
+use heliomap_model::PlantId;
 use jiff::Timestamp;
 use serde::Serialize;
 

@@ -1,6 +1,6 @@
 //! The example plant and where its modules are in its photos.
 
-use heliomap::geometry::{Camera, camera::Lens};
+use heliomap_mapping::geometry::{Camera, camera::Lens};
 use nalgebra::{Matrix3, Vector2, Vector3};
 use serde_json::{Value, json};
 use std::path::Path;

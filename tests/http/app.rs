@@ -2,19 +2,20 @@
 
 use axum::http::HeaderValue;
 use heliomap::config::{Limits, NetworkArgs};
-use heliomap::detection::{Detector, ImageDetections};
-use heliomap::geometry::{Camera, GeodeticReference, Lla};
 use heliomap::http::{AppState, router, serve};
 use heliomap::jobs::{FoundInTask, Mapper, NextTask, PipelineMapper, Stopped, Worker, WorkerSettings};
 use heliomap::oidc::Oidc;
-use heliomap::pipeline::{Found, MapError, MapOptions, Observer, Stage, Subject};
-use heliomap::plant::{
-    Bench, BenchId, Line, LineId, Module, ModuleId, ModuleStatus, PlantId, PlantModel, Sector, SectorId, Warning,
-};
-use heliomap::reconstruction::{Photo, ProjectFolder};
 use heliomap::store::{Blobs, Created, NewKey, Scope, Secret, SqliteStore, Store};
 use heliomap::telemetry::Metrics;
 use heliomap::webhooks::Targets;
+use heliomap_mapping::detection::{Detector, ImageDetections};
+use heliomap_mapping::geometry::Camera;
+use heliomap_mapping::pipeline::{Found, MapError, MapOptions, Observer, Stage, Subject};
+use heliomap_mapping::reconstruction::{Photo, ProjectFolder};
+use heliomap_model::{
+    Bench, BenchId, Line, LineId, Module, ModuleId, ModuleStatus, PlantId, PlantModel, Sector, SectorId, Warning,
+};
+use heliomap_model::{GeodeticReference, Lla};
 use nalgebra::Vector3;
 use reqwest::{Client, Method, RequestBuilder, Response, StatusCode};
 use serde_json::{Value, json};
@@ -134,7 +135,7 @@ impl Mapper for ScriptedMapper {
 fn nothing_in(image: &str) -> Found {
     let image = image.to_owned();
     let detections = ImageDetections { image, width_px: 32, height_px: 24, detections: Vec::new() };
-    let layout = heliomap::layout::infer(&detections, None, &Default::default());
+    let layout = heliomap_mapping::layout::infer(&detections, None, &Default::default());
     Found { detections, layout }
 }
 

@@ -2,8 +2,8 @@
 
 use crate::app::{App, assert_problem, plant_path};
 use crate::boxes::{EXAMPLE, true_boxes};
-use heliomap::detection::{Detection, DetectionError, Detector, Source};
-use heliomap::geometry::Quad;
+use heliomap_mapping::detection::{Detection, DetectionError, Detector, Source};
+use heliomap_mapping::geometry::Quad;
 use image::{Rgb, RgbImage};
 use reqwest::StatusCode;
 use serde_json::{Value, json};

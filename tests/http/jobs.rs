@@ -1,6 +1,6 @@
 use crate::app::{Act, App, assert_problem, job_path, jpeg, plant_path};
-use heliomap::plant::PlantId;
 use heliomap::store::{Digest, Enqueued, JobId, JobRequest, SurveyId};
+use heliomap_model::PlantId;
 use jiff::Timestamp;
 use reqwest::StatusCode;
 use serde_json::json;

@@ -2,9 +2,9 @@
 
 use crate::app::{App, job_path, plant_path};
 use crate::broken::{Files, Knowing};
-use heliomap::detection::{Detection, DetectionError, Detector};
 use heliomap::jobs::{Mapper, PipelineMapper};
 use heliomap::store::{Blobs, TaskClaim};
+use heliomap_mapping::detection::{Detection, DetectionError, Detector};
 use image::RgbImage;
 use jiff::Timestamp;
 use reqwest::StatusCode;

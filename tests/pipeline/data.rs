@@ -1,7 +1,7 @@
 //! The larger data sets, where they are there: `HELIOMAP_DATA` names their folder.
 
 use crate::survey::{can_detect, heliomap};
-use heliomap::reconstruction::photo::{DEFAULT_MAX_PIXELS, examine, inspect};
+use heliomap_mapping::reconstruction::photo::{DEFAULT_MAX_PIXELS, examine, inspect};
 use rayon::prelude::*;
 use serde_json::Value;
 use std::collections::BTreeMap;

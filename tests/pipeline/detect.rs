@@ -6,7 +6,7 @@ use serde_json::{Value, json};
 use std::path::Path;
 
 fn model(name: &str) -> String {
-    format!("{}/tests/fixtures/detection/{name}.onnx", env!("CARGO_MANIFEST_DIR"))
+    format!("{}/crates/mapping/tests/fixtures/detection/{name}.onnx", env!("CARGO_MANIFEST_DIR"))
 }
 
 /// A folder with a photo of bright modules on dark ground, in a lattice of 5 x 4; and its labels.

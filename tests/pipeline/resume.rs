@@ -1,9 +1,9 @@
 //! A mapping that is taken up again: what it had found it does not look for, and its model is the same.
 
 use crate::survey::Survey;
-use heliomap::fusion::Fused;
-use heliomap::pipeline::{Boxes, Found, MapError, MapOptions, Observer, Stage, Subject, map_folder};
-use heliomap::plant::{PlantId, PlantModel};
+use heliomap_mapping::fusion::Fused;
+use heliomap_mapping::pipeline::{Boxes, Found, MapError, MapOptions, Observer, Stage, Subject, map_folder};
+use heliomap_model::{PlantId, PlantModel};
 use std::collections::HashMap;
 use std::path::PathBuf;
 use std::sync::Mutex;

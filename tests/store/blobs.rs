@@ -1,7 +1,7 @@
 //! What every blob store must do, on local disk and in a bucket.
 
-use heliomap::plant::PlantId;
 use heliomap::store::{Blobs, Bucket, Digest, StagedFile, StoreError, UploadId};
+use heliomap_model::PlantId;
 use object_store::aws::AmazonS3Builder;
 use std::collections::HashSet;
 use std::io::Write;

@@ -21,11 +21,11 @@ pub use quotas::*;
 pub use tasks::*;
 pub use webhooks::*;
 
-use heliomap::plant::{Layer, ModuleId, PlantId, Warning};
 use heliomap::store::{
     Claim, Created, Digest, Enqueued, FileRecord, FileWritten, GeoBox, Job, JobRequest, JobState, NewFeature, NewLayer,
     NewModel, OrganisationId, Page, Plant, Quotas, Store, StoreError, Survey, SurveyPath,
 };
+use heliomap_model::{Layer, ModuleId, PlantId, Warning};
 use jiff::Timestamp;
 use std::time::Duration;
 

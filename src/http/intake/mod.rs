@@ -9,12 +9,12 @@ mod shots;
 use super::conditional;
 use super::error::{ApiError, Code};
 use super::state::AppState;
-use crate::plant::PlantId;
 use crate::store::freeing::free_abandoned;
 use crate::store::{
     Content, Digest, FileKind, FileRecord, FileWritten, StagedFile, StoreError, SurveyId, SurveyPath, Wanted,
 };
 use content::Found;
+use heliomap_model::PlantId;
 use jiff::Timestamp;
 use std::path::Path;
 use std::time::{Duration, Instant};

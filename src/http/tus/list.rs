@@ -7,9 +7,9 @@ use crate::http::error::{ApiError, Code, Problem};
 use crate::http::extract::{ApiPath, ApiQuery};
 use crate::http::file_lists::{cursor_after, path_of};
 use crate::http::paging::{List, list_limit, next_part, with_filters};
-use crate::plant::PlantId;
 use crate::store::SurveyId;
 use axum::extract::State;
+use heliomap_model::PlantId;
 use jiff::Timestamp;
 use serde::Deserialize;
 

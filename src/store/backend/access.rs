@@ -2,12 +2,12 @@
 
 use super::super::Rows;
 use super::read::{audit_entry, key, organisation};
-use crate::plant::PlantId;
 use crate::store::{
     AccessStore, ApiKey, AuditEntry, Created, Digest, KeyId, NewKey, Organisation, OrganisationId, Page, SecretRecord,
     StoreError, TimeSpan, sql,
 };
 use async_trait::async_trait;
+use heliomap_model::PlantId;
 use jiff::Timestamp;
 use sqlx::Row as _;
 use uuid::Uuid;

@@ -19,8 +19,8 @@ use super::super::{
     SurveyPath, TaskStore, Wanted,
 };
 use super::{Db, Row, Rows, Tx, queues, tell_of_work};
-use crate::plant::{Layer, ModuleId, PlantId};
 use async_trait::async_trait;
+use heliomap_model::{Layer, ModuleId, PlantId};
 use jiff::Timestamp;
 use read::{file, job, model, plant, survey};
 use sqlx::{QueryBuilder, Row as _};

@@ -1,13 +1,13 @@
 //! Rows as values.
 
 use super::super::Row;
-use crate::plant::{PlantId, Warning};
 use crate::store::requests::KeptAnswer;
 use crate::store::{
     ApiKey, AuditEntry, BlobRecord, Delivery, DeliveryId, Digest, FileRecord, Job, JobId, KeyId, Model, Organisation,
     OrganisationId, Plant, Progress, Quotas, StoreError, Survey, SurveyId, SurveyPath, Upload, UploadId, Usage,
     Webhook, WebhookId,
 };
+use heliomap_model::{PlantId, Warning};
 use jiff::Timestamp;
 use serde::de::DeserializeOwned;
 use sqlx::Row as _;

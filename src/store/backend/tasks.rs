@@ -2,9 +2,9 @@
 
 use super::super::{Db, Rows, queues, tell_of_work};
 use super::{after, read};
-use crate::plant::PlantId;
 use crate::store::{Checkpoint, Claim, GivenBack, ImageTask, JobId, OwnTask, StoreError, TaskClaim, TaskStore, sql};
 use async_trait::async_trait;
+use heliomap_model::PlantId;
 use jiff::Timestamp;
 use sqlx::{QueryBuilder, Row as _};
 use std::time::Duration;

@@ -3,9 +3,9 @@
 use super::super::{Db, Row, Rows, Tx};
 use super::read;
 use super::usage::quotas;
-use crate::plant::PlantId;
 use crate::store::{Piece, StoreError, SurveyId, Upload, UploadBounds, UploadId, UploadStore, sql};
 use async_trait::async_trait;
+use heliomap_model::PlantId;
 use jiff::Timestamp;
 use sqlx::{QueryBuilder, Row as _};
 use std::time::Duration;

@@ -2,10 +2,10 @@
 
 use super::super::{Row, Rows, Tx};
 use super::read::{self, organisation, usage};
-use crate::plant::PlantId;
 use crate::store::usage::{Quotas, UNLIMITED, UnusedBlob, Usage, UsageStore};
 use crate::store::{Digest, Organisation, OrganisationId, StoreError, SurveyId, sql};
 use async_trait::async_trait;
+use heliomap_model::PlantId;
 use jiff::Timestamp;
 use sqlx::Row as _;
 use std::time::Duration;

@@ -1,12 +1,12 @@
 //! Organisations, keys, the audit log, and requests that may be sent again.
 
 use super::{ALL, ORGANISATION, at};
-use heliomap::plant::PlantId;
 use heliomap::store::requests::{Begun, KeptAnswer};
 use heliomap::store::{
     AuditEntry, Created, Digest, KeyId, NewKey, OrganisationId, Page, Quotas, Scope, SecretRecord, Store, StoreError,
     TimeSpan,
 };
+use heliomap_model::PlantId;
 use uuid::Uuid;
 
 async fn organisation(store: &dyn Store, name: &str) -> OrganisationId {

@@ -1,10 +1,10 @@
 //! Files of surveys, and how they come.
 
 use super::{LEASE, at, claim, enqueue, file, model, plant, put, reserve, survey};
-use heliomap::reconstruction::PhotoFacts;
 use heliomap::store::{
     Digest, FileRecord, FileWritten, Piece, Store, StoreError, SurveyId, SurveyPath, Upload, UploadId, Wanted,
 };
+use heliomap_mapping::reconstruction::PhotoFacts;
 use uuid::Uuid;
 
 pub async fn files_all_or_none(store: &dyn Store) {

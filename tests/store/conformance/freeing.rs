@@ -1,8 +1,8 @@
 //! What becomes of bytes that nothing names any more.
 
 use super::{LEASE, ORGANISATION, at, claim, enqueue, file, model, plant, put, reserve, survey};
-use heliomap::plant::PlantId;
 use heliomap::store::{Digest, Ending, FileRecord, Quotas, Store, StoreError, UnusedBlob};
+use heliomap_model::PlantId;
 
 /// `images/NAME` with this content, stored at a time.
 fn photo(name: &str, content: &str, stored: i64) -> FileRecord {

@@ -1,10 +1,10 @@
 //! The queue.
 
 use super::{ALL, LEASE, at, claim, enqueue, model, plant, state, survey};
-use heliomap::plant::PlantId;
 use heliomap::store::{
     Cancelled, Checkpoint, Completed, Ending, Enqueued, Heartbeat, JobRequest, JobState, Page, Progress, Store,
 };
+use heliomap_model::PlantId;
 use std::time::Duration;
 use uuid::Uuid;
 

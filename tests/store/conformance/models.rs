@@ -1,8 +1,8 @@
 //! Models and their features.
 
 use super::{ALL, at, claim, enqueue, model, plant, state, survey};
-use heliomap::plant::{Layer, ModuleId};
 use heliomap::store::{Completed, Digest, FeatureQuery, GeoBox, JobState, Store};
+use heliomap_model::{Layer, ModuleId};
 
 pub async fn models_and_features(store: &dyn Store) {
     let survey = survey(store, plant(store, "A").await.id, "June").await;

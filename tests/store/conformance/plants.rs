@@ -1,11 +1,11 @@
 //! Plants, surveys, and lists of them.
 
 use super::{ALL, LEASE, ORGANISATION, at, claim, enqueue, file, model, plant, put, survey};
-use heliomap::plant::{Layer, ModuleId, PlantId};
 use heliomap::store::{
     AuditEntry, Created, Digest, Heartbeat, JobState, NewKey, Page, Quotas, Scope, SecretRecord, Store, StoreError,
     SurveyId, TimeSpan,
 };
+use heliomap_model::{Layer, ModuleId, PlantId};
 use uuid::Uuid;
 
 pub async fn plants_and_surveys(store: &dyn Store) {

@@ -1,11 +1,11 @@
 //! What organisations keep, and may keep.
 
 use super::{LEASE, ORGANISATION, at, claim, enqueue, model, plant, survey};
-use heliomap::plant::PlantId;
 use heliomap::store::usage::UNLIMITED;
 use heliomap::store::{
     Created, Digest, OrganisationId, Quotas, Store, StoreError, Upload, UploadBounds, UploadId, Usage,
 };
+use heliomap_model::PlantId;
 use uuid::Uuid;
 
 pub async fn quotas(store: &dyn Store) {

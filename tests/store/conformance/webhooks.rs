@@ -1,11 +1,11 @@
 //! Webhooks and the messages to them.
 
 use super::{ALL, LEASE, ORGANISATION, at, claim, enqueue, model, plant, survey};
-use heliomap::plant::PlantId;
 use heliomap::store::{
     Completed, Created, DeliveryState, Ending, JobId, NewWebhook, OrganisationId, Quotas, Sent, SigningSecret, Store,
     StoreError, Webhook, WebhookId,
 };
+use heliomap_model::PlantId;
 use std::time::Duration;
 use uuid::Uuid;
 
