@@ -8,7 +8,7 @@ use heliomap_mapping::detection::{Detector, ImageDetections, external, scale};
 use heliomap_mapping::geometry::Camera;
 use heliomap_mapping::pipeline;
 use heliomap_mapping::reconstruction::{Photo, photo};
-use heliomap_overlay;
+use heliomap_overlay as overlay;
 use image::RgbImage;
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};

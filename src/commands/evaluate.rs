@@ -2,7 +2,7 @@
 
 use super::output::{Output, prepare_folder, print};
 use anyhow::bail;
-use heliomap_evaluation::{self, read_model};
+use heliomap_evaluation::{self as evaluation, read_model};
 use std::path::PathBuf;
 
 /// Compare a plant with a truth or any reference model.

@@ -9,7 +9,7 @@ use heliomap_evaluation::detection::{DetectionReport, LabelledPhoto, PhotoScore,
 use heliomap_mapping::detection::{Detector, ImageDetections, external};
 use heliomap_mapping::geometry::Quad;
 use heliomap_mapping::reconstruction::photo::DEFAULT_MAX_PIXELS;
-use heliomap_overlay;
+use heliomap_overlay as overlay;
 use std::path::{Path, PathBuf};
 
 /// Measure a detector, or a file of boxes, against labelled photos.

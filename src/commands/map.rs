@@ -7,7 +7,7 @@ use heliomap::config::DetectorArgs;
 use heliomap_mapping::pipeline::{self, Boxes, MapOptions, Observer, Stage, Subject};
 use heliomap_mapping::refinement::{Control, Method};
 use heliomap_model::{Layer, PlantId, PlantModel};
-use heliomap_overlay;
+use heliomap_overlay as overlay;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde_json::json;
 use std::fmt::Write;

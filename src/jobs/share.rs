@@ -1,7 +1,7 @@
 //! A running job's images, shared with other workers: the side of the worker whose job it is.
 
 use crate::store::{Claim, Digest, FileRecord, ImageTask, OwnTask, Store, StoreError};
-use heliomap_mapping::pipeline::{Found, Sought, Turn};
+use heliomap_mapping::pipeline::{Found, ImageRequest, NextImage};
 use heliomap_model::PlantId;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -18,7 +18,7 @@ const GATHER_EVERY: Duration = Duration::from_millis(100);
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Errand {
     /// The image; its path is relative to the survey's folder.
-    pub sought: Sought,
+    pub sought: ImageRequest,
     /// The bytes of its photo, SHA-256, hexadecimal.
     pub sha256: String,
 }
@@ -52,7 +52,7 @@ impl Share {
     }
 
     /// Offers images; `false` where the job is in other hands. What cannot be offered is searched here.
-    pub fn offer(&self, images: &[Sought]) -> bool {
+    pub fn offer(&self, images: &[ImageRequest]) -> bool {
         let tasks: Option<Vec<ImageTask>> = images.iter().map(|image| self.task(image)).collect();
         let Some(tasks) = tasks else { return true };
         let offer = self.store.offer_tasks(&self.claim, &self.fingerprint, &self.mapper, &tasks);
@@ -70,43 +70,43 @@ impl Share {
         }
     }
 
-    fn task(&self, image: &Sought) -> Option<ImageTask> {
+    fn task(&self, image: &ImageRequest) -> Option<ImageTask> {
         let path = image.path.strip_prefix(&self.folder).ok()?.to_owned();
         let sha256 = self.digests.get(&path)?.to_string();
-        let errand = Errand { sought: Sought { path, ..image.clone() }, sha256 };
+        let errand = Errand { sought: ImageRequest { path, ..image.clone() }, sha256 };
         Some(ImageTask { image: image.image.clone(), document: serde_json::to_string(&errand).ok()? })
     }
 
     /// What is next, of the images `left`.
-    pub fn next(&self, left: &[usize]) -> Turn {
+    pub fn next(&self, left: &[usize]) -> NextImage {
         let mut state = self.state();
         if state.places.is_empty() {
-            return Turn::Search(left[0]);
+            return NextImage::Search(left[0]);
         }
         if state.gathered.is_none_or(|last| last.elapsed() >= GATHER_EVERY) {
             self.gather(&mut state);
         }
         if let Some((place, found)) = state.found.pop_front() {
-            return Turn::Found(place, found);
+            return NextImage::Found(place, found);
         }
         match self.runtime.block_on(self.store.take_own_task(&self.claim, Timestamp::now())) {
             Ok(OwnTask::Image(image)) => match state.places.get(&image) {
-                Some(place) if left.contains(place) => Turn::Search(*place),
-                _ => Turn::Wait,
+                Some(place) if left.contains(place) => NextImage::Search(*place),
+                _ => NextImage::Wait,
             },
-            Ok(OwnTask::InOtherHands) => Turn::Wait,
+            Ok(OwnTask::InOtherHands) => NextImage::Wait,
             // What others did and cannot be read, or what nobody has: it is searched here.
             Ok(OwnTask::None) => {
                 self.gather(&mut state);
                 match state.found.pop_front() {
-                    Some((place, found)) => Turn::Found(place, found),
-                    None => Turn::Search(left[0]),
+                    Some((place, found)) => NextImage::Found(place, found),
+                    None => NextImage::Search(left[0]),
                 }
             }
             Err(error) => {
                 // The heartbeat tells when this has lasted too long.
                 tracing::warn!(%error, "cannot look which image is next");
-                Turn::Wait
+                NextImage::Wait
             }
         }
     }

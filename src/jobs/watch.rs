@@ -3,7 +3,7 @@
 use super::share::Share;
 use crate::store::{Checkpoint, Progress};
 use heliomap_mapping::fusion::Fused;
-use heliomap_mapping::pipeline::{Found, Observer, Sought, Stage, Turn};
+use heliomap_mapping::pipeline::{Found, ImageRequest, NextImage, Observer, Stage};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::io::{Cursor, Read};
@@ -249,23 +249,23 @@ impl Observer for Watch {
         self.stopped().is_some()
     }
 
-    fn recall(&self, image: &str) -> Option<Found> {
+    fn load_checkpoint(&self, image: &str) -> Option<Found> {
         let found = locked(&self.findings).known.remove(image)?;
         locked(&self.seen).recalled += 1;
         Some(found)
     }
 
-    fn offer(&self, images: &[Sought]) {
+    fn offer(&self, images: &[ImageRequest]) {
         if self.share.get().is_some_and(|share| !share.offer(images)) {
             self.stop(Stop::Lost);
         }
     }
 
-    fn next(&self, left: &[usize]) -> Turn {
-        self.share.get().map_or(Turn::Search(left[0]), |share| share.next(left))
+    fn next(&self, left: &[usize]) -> NextImage {
+        self.share.get().map_or(NextImage::Search(left[0]), |share| share.next(left))
     }
 
-    fn found(&self, found: &Found) {
+    fn save_checkpoint(&self, found: &Found) {
         let mut document = Vec::new();
         if ciborium::into_writer(found, &mut document).is_ok() {
             let name = found.detections.image.clone();
@@ -273,7 +273,7 @@ impl Observer for Watch {
         }
     }
 
-    fn recall_structure(&self, of: &str) -> Option<Fused> {
+    fn load_structure(&self, of: &str) -> Option<Fused> {
         let parts = std::mem::take(&mut locked(&self.findings).structure);
         // One of which parts are missing is fused again.
         let (was_of, fused): (String, Fused) = ciborium::from_reader(parts).ok()?;
@@ -284,7 +284,7 @@ impl Observer for Watch {
         Some(fused)
     }
 
-    fn structure(&self, fused: &Fused, of: &str) {
+    fn save_structure(&self, fused: &Fused, of: &str) {
         let mut document = Vec::new();
         if ciborium::into_writer(&(of, fused), &mut document).is_ok() {
             let parts = document.chunks(PART_BYTES).enumerate();
@@ -338,15 +338,15 @@ mod tests {
         assert!(!layout.pieces.is_empty());
         let found = Found { detections, layout };
         let watch = Watch::default();
-        watch.found(&found);
+        watch.save_checkpoint(&found);
         let (_, kept) = watch.take_found();
         assert!(watch.take_found().1.is_empty());
         let again = Watch::default();
         again.begin("f".to_owned(), kept, None);
-        let recalled = again.recall("a.jpg").unwrap();
+        let recalled = again.load_checkpoint("a.jpg").unwrap();
         // Debug output of a float has all its digits.
         assert_eq!(format!("{recalled:?}"), format!("{found:?}"));
-        assert!(again.recall("a.jpg").is_none() && again.recall("b.jpg").is_none());
+        assert!(again.load_checkpoint("a.jpg").is_none() && again.load_checkpoint("b.jpg").is_none());
     }
 
     #[test]
@@ -361,7 +361,7 @@ mod tests {
         let fused = Fused { lines: Vec::new(), benches: Vec::new(), doubts: (0..12).map(bench).collect() };
         let watch = Watch::default();
         let of = "what was seen";
-        watch.structure(&fused, of);
+        watch.save_structure(&fused, of);
         let mut kept = Vec::new();
         loop {
             let (_, parts) = watch.take_found();
@@ -380,17 +380,17 @@ mod tests {
         assert_eq!(kept.len(), 7);
         let again = Watch::default();
         again.begin("f".to_owned(), kept.clone(), None);
-        assert_eq!(again.recall_structure(of).unwrap().doubts, fused.doubts);
-        assert!(again.recall_structure(of).is_none() && again.pace().is_none());
+        assert_eq!(again.load_structure(of).unwrap().doubts, fused.doubts);
+        assert!(again.load_structure(of).is_none() && again.pace().is_none());
         // It is no other images' structure.
         again.begin("f".to_owned(), kept.clone(), None);
-        assert!(again.recall_structure("what was seen again").is_none());
+        assert!(again.load_structure("what was seen again").is_none());
         for missing in 0..kept.len() {
             let mut parts = kept.clone();
             parts.remove(missing);
             let again = Watch::default();
             again.begin("f".to_owned(), parts, None);
-            assert!(again.recall_structure(of).is_none(), "without part {missing}");
+            assert!(again.load_structure(of).is_none(), "without part {missing}");
         }
     }
 

@@ -98,7 +98,7 @@ impl Mapper for ScriptedMapper {
                 Ok(model(subject, options, 1))
             }
             Act::FindOneAndFail => {
-                let next = (0..).find(|image| match observer.recall(&image.to_string()) {
+                let next = (0..).find(|image| match observer.load_checkpoint(&image.to_string()) {
                     Some(found) => {
                         assert_eq!(found.detections.image, image.to_string());
                         false
@@ -106,7 +106,7 @@ impl Mapper for ScriptedMapper {
                     None => true,
                 });
                 let found = nothing_in(&next.unwrap().to_string());
-                observer.found(&found);
+                observer.save_checkpoint(&found);
                 Err(MapError::Environment { message: format!("image {} was found", found.detections.image) })
             }
             Act::Wait => {

@@ -40,22 +40,22 @@ impl Observer for Life {
         self.ends_at.is_some_and(|end| self.stages.lock().unwrap().contains(&end))
     }
 
-    fn recall(&self, image: &str) -> Option<Found> {
+    fn load_checkpoint(&self, image: &str) -> Option<Found> {
         let kept = self.known.lock().unwrap().images.remove(image)?;
         Some(ciborium::from_reader(kept.as_slice()).unwrap())
     }
 
-    fn found(&self, found: &Found) {
+    fn save_checkpoint(&self, found: &Found) {
         self.kept.lock().unwrap().images.insert(found.detections.image.clone(), bytes(found));
     }
 
-    fn recall_structure(&self, of: &str) -> Option<Fused> {
+    fn load_structure(&self, of: &str) -> Option<Fused> {
         let (was_of, kept) = self.known.lock().unwrap().structure.take()?;
         assert_eq!(was_of, of, "the same was seen");
         Some(ciborium::from_reader(kept.as_slice()).unwrap())
     }
 
-    fn structure(&self, fused: &Fused, of: &str) {
+    fn save_structure(&self, fused: &Fused, of: &str) {
         self.kept.lock().unwrap().structure = Some((of.to_owned(), bytes(fused)));
     }
 }

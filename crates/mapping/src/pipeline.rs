@@ -23,8 +23,8 @@ pub mod search;
 
 pub use error::MapError;
 pub use options::MapOptions;
-pub use progress::{Observer, Stage, StageTiming, Turn};
-pub use search::{Loaded, Sought};
+pub use progress::{NextImage, Observer, Stage, StageTiming};
+pub use search::{ImageRequest, Loaded};
 
 /// What the model is of.
 #[derive(Debug, Clone)]
@@ -107,13 +107,13 @@ pub fn map_folder(
         .map(|((shot, detections), layout)| View { shot, detections, layout })
         .collect();
     let of = digest(&detections, &layouts);
-    let fused = match observer.recall_structure(&of) {
+    let fused = match observer.load_structure(&of) {
         Some(fused) => fused,
         None => {
             let located = clock.stage(Stage::Locate, || fusion::locate::locate(&views, &cloud))?;
             let fusion_options = FusionOptions { rows_per_bench: options.rows_per_bench, ..FusionOptions::default() };
             let fused = clock.stage(Stage::Fuse, || fusion::fuse(&views, located, &fusion_options))?;
-            observer.structure(&fused, &of);
+            observer.save_structure(&fused, &of);
             fused
         }
     };
@@ -157,15 +157,15 @@ pub fn map_folder(
     Ok(Mapping { model, timings, photos, shots, detections, layouts, fused, refined })
 }
 
-/// Tells what was seen in images from everything else that may be.
+/// SHA-256 of the detections and layouts, hexadecimal: the key of the structure's checkpoint.
 fn digest(detections: &[ImageDetections], layouts: &[Layout]) -> String {
     let mut hashed = Hashed(Sha256::new());
-    // What hashes takes everything, and these have been written before.
+    // Writing to a hash cannot fail.
     let _ = ciborium::into_writer(&(detections, layouts), &mut hashed);
     hashed.0.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// Takes bytes, and keeps their digest alone.
+/// A writer that hashes what is written.
 struct Hashed(Sha256);
 
 impl Write for Hashed {
@@ -180,7 +180,7 @@ impl Write for Hashed {
 }
 
 /// The photos of a folder as OpenSfM leaves it that [`map_folder`] searches, those too coarse to resolve modules left out,
-/// with the ground sampling distance of each in metres per pixel where the reconstruction tells.
+/// with the ground sampling distance of each in metres per pixel where it is known.
 ///
 /// # Errors
 /// Broken input, by file.

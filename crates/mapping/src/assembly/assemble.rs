@@ -1,11 +1,12 @@
 //! The refined structure becomes the plant model: labels, identifiers, corners on the ground.
 
 use super::resurvey;
-use crate::fusion::{Doubt, Fused, View};
+use crate::fusion::{Doubt, Fused, FusedBench, View};
 use crate::refinement::{Refined, RefinedBench};
-use heliomap_model::GeodeticReference;
-use heliomap_model::{Bench, Line, Module, ModuleStatus, PlantModel, Sector, Warning};
-use heliomap_model::{BenchId, LineId, ModuleId, PlantId, SectorId};
+use heliomap_model::{
+    Bench, BenchId, GeodeticReference, Line, LineId, Module, ModuleId, ModuleStatus, PlantId, PlantModel, Sector,
+    SectorId, Warning,
+};
 use nalgebra::Vector3;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
@@ -19,8 +20,7 @@ pub struct Identity<'a> {
     pub previous: Option<&'a PlantModel>,
 }
 
-/// Assembles the model. Identifiers of `identity.previous` are kept by everything that is found again; what is new gets
-/// the next ones.
+/// Assembles the model. What is found again keeps its identifier of `identity.previous`; what is new gets the next ones.
 pub fn assemble(
     views: &[View<'_>],
     fused: &Fused,
@@ -30,17 +30,9 @@ pub fn assemble(
     identity: &Identity<'_>,
     mut warnings: Vec<Warning>,
 ) -> PlantModel {
-    let mut drafts: Vec<Draft> = Vec::new();
-    for (line_index, line) in fused.lines.iter().enumerate() {
-        for &bench_index in &line.benches {
-            let (bench, refined) = (&fused.benches[bench_index], &refined.benches[bench_index]);
-            for (module, position) in bench.modules.iter().zip(&refined.modules) {
-                drafts.push(Draft { line_index, bench_index, module, position, bench: refined });
-            }
-        }
-    }
+    let drafts = drafts(fused, refined);
     let mut registry = Registry::new(identity.plant, reference, identity.previous, &drafts);
-    let mut model = PlantModel {
+    let model = PlantModel {
         plant: identity.plant,
         plant_name: identity.plant_name.to_owned(),
         version: identity.previous.map_or(1, |previous| previous.version + 1),
@@ -55,71 +47,22 @@ pub fn assemble(
         warnings: Vec::new(),
         serials: [0; 4],
     };
-    let mut next_draft = 0;
-    let mut named: Vec<Option<(BenchId, String)>> = vec![None; fused.benches.len()];
+    let labels = vec![None; fused.benches.len()];
+    let mut assembly = Assembly { views, registry: &mut registry, model, labels };
+    let mut drafts = drafts.iter().enumerate();
     for (line_index, line) in fused.lines.iter().enumerate() {
         let line_label = format!("L{:02}", line_index + 1);
-        let line_id = registry.line(line_index);
-        model.lines.push(Line { id: line_id, label: line_label.clone(), index: line_index as u32 + 1 });
+        let line_id = assembly.registry.line(line_index);
+        assembly.model.lines.push(Line { id: line_id, label: line_label.clone(), index: line_index as u32 + 1 });
         for (bench_in_line, &bench_index) in line.benches.iter().enumerate() {
+            let place =
+                BenchPlace { line: line_id, line_label: &line_label, in_line: bench_in_line, index: bench_index };
             let bench = &fused.benches[bench_index];
-            let bench_label = format!("{line_label}-B{:02}", bench_in_line + 1);
-            let bench_id = registry.bench(bench_index);
-            named[bench_index] = Some((bench_id, bench_label.clone()));
-            model.benches.push(Bench {
-                id: bench_id,
-                label: bench_label.clone(),
-                line: line_id,
-                index: bench_in_line as u32 + 1,
-                rows: bench.rows as u32,
-                columns: bench.cols as u32,
-                open_ended: bench.open_ended,
-                confidence: bench.confidence,
-            });
-            let mut sector_ids = BTreeMap::new();
-            for row in 0..bench.rows {
-                if bench.modules.iter().any(|module| module.row == row) {
-                    let id = registry.sector(bench_index, row);
-                    sector_ids.insert(row, id);
-                    model.sectors.push(Sector {
-                        id,
-                        label: format!("{bench_label}-R{}", row + 1),
-                        line: line_id,
-                        bench: bench_id,
-                        row: row as u32 + 1,
-                    });
-                }
-            }
-            for module in &bench.modules {
-                let draft = &drafts[next_draft];
-                let images: BTreeSet<String> =
-                    module.observations.iter().map(|o| views[o.view].shot.name.clone()).collect();
-                model.modules.push(Module {
-                    id: registry.module(next_draft),
-                    label: format!("{bench_label}-R{}-{:03}", module.row + 1, module.col + 1),
-                    line: line_id,
-                    bench: bench_id,
-                    sector: sector_ids[&module.row],
-                    row: module.row as u32 + 1,
-                    number: module.col as u32 + 1,
-                    corners_enu_m: draft.corners(),
-                    center_enu_m: draft.position.center_m,
-                    normal_enu: draft.bench.normal(),
-                    width_m: draft.bench.module_size_m[0],
-                    height_m: draft.bench.module_size_m[1],
-                    sigma_enu_m: draft.position.sigma_m,
-                    images: images.into_iter().collect(),
-                    status: if module.inferred_in.is_empty() {
-                        ModuleStatus::Detected
-                    } else {
-                        ModuleStatus::Confirmed
-                    },
-                });
-                next_draft += 1;
-            }
+            assembly.bench(place, bench, drafts.by_ref().take(bench.modules.len()));
         }
     }
-    warnings.extend(fused.doubts.iter().map(|doubt| warning(doubt, &named)));
+    let Assembly { mut model, labels, .. } = assembly;
+    warnings.extend(fused.doubts.iter().map(|doubt| warning(doubt, &labels)));
     warnings.extend(registry.warning.take());
     warnings.sort();
     warnings.dedup();
@@ -128,7 +71,109 @@ pub fn assemble(
     model
 }
 
-/// What a doubt tells a person: benches by their labels, as on the map.
+/// All modules in the order of lines, benches and modules.
+fn drafts<'a>(fused: &'a Fused, refined: &'a Refined) -> Vec<Draft<'a>> {
+    let mut drafts = Vec::new();
+    for (line_index, line) in fused.lines.iter().enumerate() {
+        for &bench_index in &line.benches {
+            let (bench, refined) = (&fused.benches[bench_index], &refined.benches[bench_index]);
+            for (module, position) in bench.modules.iter().zip(&refined.modules) {
+                drafts.push(Draft { line_index, bench_index, module, position, bench: refined });
+            }
+        }
+    }
+    drafts
+}
+
+/// Where a bench stands: in which line, and its index there and among the fused benches.
+#[derive(Clone, Copy)]
+struct BenchPlace<'a> {
+    line: LineId,
+    line_label: &'a str,
+    in_line: usize,
+    index: usize,
+}
+
+/// A model that is being assembled.
+struct Assembly<'a> {
+    views: &'a [View<'a>],
+    registry: &'a mut Registry,
+    model: PlantModel,
+    /// Identifier and label of each fused bench that is in the model.
+    labels: Vec<Option<(BenchId, String)>>,
+}
+
+impl Assembly<'_> {
+    /// Adds a bench with its sectors and modules.
+    fn bench<'d>(
+        &mut self,
+        place: BenchPlace<'_>,
+        bench: &FusedBench,
+        drafts: impl Iterator<Item = (usize, &'d Draft<'d>)>,
+    ) {
+        let label = format!("{}-B{:02}", place.line_label, place.in_line + 1);
+        let id = self.registry.bench(place.index);
+        self.labels[place.index] = Some((id, label.clone()));
+        self.model.benches.push(Bench {
+            id,
+            label: label.clone(),
+            line: place.line,
+            index: place.in_line as u32 + 1,
+            rows: bench.rows as u32,
+            columns: bench.cols as u32,
+            open_ended: bench.open_ended,
+            confidence: bench.confidence,
+        });
+        let sectors = self.sectors(place, bench, id, &label);
+        for (number, draft) in drafts {
+            let module = draft.module;
+            let images: BTreeSet<String> =
+                module.observations.iter().map(|o| self.views[o.view].shot.name.clone()).collect();
+            self.model.modules.push(Module {
+                id: self.registry.module(number),
+                label: format!("{label}-R{}-{:03}", module.row + 1, module.col + 1),
+                line: place.line,
+                bench: id,
+                sector: sectors[&module.row],
+                row: module.row as u32 + 1,
+                number: module.col as u32 + 1,
+                corners_enu_m: draft.corners(),
+                center_enu_m: draft.position.center_m,
+                normal_enu: draft.bench.normal(),
+                width_m: draft.bench.module_size_m[0],
+                height_m: draft.bench.module_size_m[1],
+                sigma_enu_m: draft.position.sigma_m,
+                images: images.into_iter().collect(),
+                status: if module.inferred_in.is_empty() { ModuleStatus::Detected } else { ModuleStatus::Confirmed },
+            });
+        }
+    }
+
+    /// Adds a sector for each row of a bench that has modules: the sectors by row.
+    fn sectors(
+        &mut self,
+        place: BenchPlace<'_>,
+        bench: &FusedBench,
+        bench_id: BenchId,
+        bench_label: &str,
+    ) -> BTreeMap<i32, SectorId> {
+        let mut sectors = BTreeMap::new();
+        for row in (0..bench.rows).filter(|row| bench.modules.iter().any(|module| module.row == *row)) {
+            let id = self.registry.sector(place.index, row);
+            sectors.insert(row, id);
+            self.model.sectors.push(Sector {
+                id,
+                label: format!("{bench_label}-R{}", row + 1),
+                line: place.line,
+                bench: bench_id,
+                row: row as u32 + 1,
+            });
+        }
+        sectors
+    }
+}
+
+/// The warning of a doubt, with benches by their labels as on the map.
 fn warning(doubt: &Doubt, named: &[Option<(BenchId, String)>]) -> Warning {
     let (mut benches, labels): (Vec<BenchId>, Vec<&str>) = doubt
         .benches
@@ -165,7 +210,7 @@ impl Draft<'_> {
     }
 }
 
-/// Gives identifiers: the old ones to what is found again, new ones to the rest.
+/// Assigns identifiers: the previous ones to what is found again, new ones to the rest.
 struct Registry {
     plant: PlantId,
     serials: [u64; 4],
@@ -173,7 +218,6 @@ struct Registry {
     benches: HashMap<usize, BenchId>,
     sectors: HashMap<(usize, i32), SectorId>,
     modules: HashMap<usize, ModuleId>,
-    /// What is not sure about them.
     warning: Option<Warning>,
 }
 
@@ -191,7 +235,7 @@ impl Registry {
         let Some(previous) = previous else { return registry };
         let (new, old) = compared(reference, previous, drafts);
         let found = resurvey::find_again(&new, &old);
-        registry.warning = told(&found, previous.modules.len());
+        registry.warning = identifier_warning(&found, previous.modules.len());
         let pairs = found.pairs;
         for &(draft, old) in &pairs {
             registry.modules.insert(draft, previous.modules[old].id);
@@ -237,17 +281,17 @@ impl Registry {
     }
 }
 
-/// What a person should know of the identifiers that live on.
-fn told(found: &resurvey::FoundAgain, old_modules: usize) -> Option<Warning> {
-    if old_modules > 0 && found.pairs.is_empty() {
-        let message = "nothing of the model before was found again within 15 m: all identifiers are new; check whether these \
+/// A warning where the identifiers of the previous model could not be carried over, or not surely.
+fn identifier_warning(found: &resurvey::FoundAgain, previous_modules: usize) -> Option<Warning> {
+    if previous_modules > 0 && found.pairs.is_empty() {
+        let message = "no module of the previous model was found again within 15 m: all identifiers are new; check that these \
                        images are of the same plant";
         return Some(Warning::new("identifiers_new", message, []));
     }
     let other_m = found.or_moved_by_m?;
     let message = format!(
-        "the plant fits the model before as well if it is moved by {:.1} m east and {:.1} m north: the ends of its benches do \
-         not tell which of its modules are which, and identifiers may have moved to neighbours; known places (control) tell",
+        "the plant fits the previous model equally well when moved by {:.1} m east and {:.1} m north: bench ends do not decide \
+         between the two, so identifiers may have moved to neighbouring modules; control points would decide",
         other_m.x, other_m.y
     );
     Some(Warning::new("identifiers_unsure", message, []))

@@ -1,8 +1,8 @@
-//! Which images are looked at, and what was seen in them: by a detector, by an earlier run, by others, or from a file.
+//! Which images are searched, and the boxes in them: from a detector, a checkpoint, another worker, or a file.
 
 use super::progress::Clock;
-use super::search::{self, Loaded, Sought};
-use super::{Found, MapError, MapOptions, Observer, Stage, Turn};
+use super::search::{self, ImageRequest, Loaded};
+use super::{Found, MapError, MapOptions, NextImage, Observer, Stage};
 use crate::detection::external;
 use crate::detection::{Detector, ImageDetections};
 use crate::geometry::PointCloud;
@@ -120,23 +120,23 @@ pub(super) fn search(
     let observer = clock.observer;
     let start = Instant::now();
     let total = chosen.len();
-    let (seen, shots): (Vec<Seen>, Vec<usize>) = recalled(project, chosen, observer);
+    let (seen, shots): (Vec<Seen>, Vec<usize>) = from_checkpoints(project, chosen, observer);
     observer.progress(Stage::Detect, seen.len(), total);
-    let sought: Vec<Sought> = shots
+    let requests: Vec<ImageRequest> = shots
         .iter()
         .map(|&shot| {
             let Photo { shot: image, path, camera, .. } = project.photos[shot].clone();
-            Sought { image, path, camera, gsd_m: gsd_m[shot], max_pixels }
+            ImageRequest { image, path, camera, gsd_m: gsd_m[shot], max_pixels }
         })
         .collect();
-    observer.offer(&sought);
+    observer.offer(&requests);
     let seen = Mutex::new(seen);
     let keep = |image: usize, found: Found| {
         let mut seen = seen.lock().unwrap_or_else(PoisonError::into_inner);
         seen.push(Seen::new(shots[image], found));
         observer.progress(Stage::Detect, seen.len(), total);
     };
-    let mut left: Vec<usize> = (0..sought.len()).collect();
+    let mut left: Vec<usize> = (0..requests.len()).collect();
     let next = || loop {
         if left.is_empty() {
             return None;
@@ -145,24 +145,24 @@ pub(super) fn search(
             return Some(Err(MapError::Cancelled));
         }
         match observer.next(&left) {
-            Turn::Search(image) => {
+            NextImage::Search(image) => {
                 left.retain(|other| *other != image);
                 let shot = shots[image];
                 let pixels = folder.load(&project.photos[shot]).map_err(MapError::from);
-                let name = sought[image].image.clone();
+                let name = requests[image].image.clone();
                 return Some(pixels.map(|pixels| Loaded { key: image, image: name, pixels, gsd_m: gsd_m[shot] }));
             }
             // What was found twice counts once.
-            Turn::Found(image, found) if left.contains(&image) => {
+            NextImage::Found(image, found) if left.contains(&image) => {
                 left.retain(|other| *other != image);
                 keep(image, *found);
             }
-            Turn::Found(..) => {}
-            Turn::Wait => std::thread::sleep(WAIT_FOR_OTHERS),
+            NextImage::Found(..) => {}
+            NextImage::Wait => std::thread::sleep(WAIT_FOR_OTHERS),
         }
     };
     let found = |image: usize, found: Found| {
-        observer.found(&found);
+        observer.save_checkpoint(&found);
         keep(image, found);
     };
     let layout_time = search::search(detector, next, found, || observer.cancelled())?;
@@ -176,15 +176,15 @@ pub(super) fn search(
 }
 
 /// What an earlier run found in these shots, and the shots in which it had not looked.
-fn recalled(project: &Project, chosen: &[usize], observer: &dyn Observer) -> (Vec<Seen>, Vec<usize>) {
-    let (mut seen, mut sought) = (Vec::new(), Vec::new());
+fn from_checkpoints(project: &Project, chosen: &[usize], observer: &dyn Observer) -> (Vec<Seen>, Vec<usize>) {
+    let (mut seen, mut requests) = (Vec::new(), Vec::new());
     for &shot in chosen {
-        match observer.recall(&project.reconstruction.shots[shot].name) {
+        match observer.load_checkpoint(&project.reconstruction.shots[shot].name) {
             Some(found) => seen.push(Seen::new(shot, found)),
-            None => sought.push(shot),
+            None => requests.push(shot),
         }
     }
-    (seen, sought)
+    (seen, requests)
 }
 
 /// Takes the boxes of a file instead of searching; images are decoded only to look at the ground between modules.
@@ -296,13 +296,13 @@ pub(super) fn from_boxes(
                 if observer.cancelled() {
                     return Err(MapError::Cancelled);
                 }
-                if let Some(found) = observer.recall(&detections.image) {
+                if let Some(found) = observer.load_checkpoint(&detections.image) {
                     return Ok(Seen::new(shot, found));
                 }
                 let grey = image::imageops::grayscale(&folder.load(&project.photos[shot])?);
                 let layout = layout::infer(&detections, Some(&grey), &LayoutOptions::default());
                 let found = Found { detections, layout };
-                observer.found(&found);
+                observer.save_checkpoint(&found);
                 Ok(Seen::new(shot, found))
             })
             .collect()

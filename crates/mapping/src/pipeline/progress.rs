@@ -1,6 +1,6 @@
-//! What a mapping tells while it runs, and what it asks.
+//! Progress of a mapping, its checkpoints, and the sharing of its images with other workers.
 
-use super::{Found, MapError, Sought};
+use super::{Found, ImageRequest, MapError};
 use crate::fusion::Fused;
 use std::time::{Duration, Instant};
 
@@ -47,11 +47,11 @@ impl Stage {
 pub struct StageTiming {
     pub stage: Stage,
     pub wall: Duration,
-    /// Highest resident memory of the process so far, bytes; `None` where the system does not say.
+    /// Highest resident memory of the process so far, bytes; `None` where the system does not report it.
     pub peak_memory_bytes: Option<u64>,
 }
 
-/// Told of progress, asked whether to stop. Called from several threads.
+/// Receives the progress of a mapping, and keeps its checkpoints. Called from several threads.
 pub trait Observer: Sync {
     /// `done` of `total` units of a stage are finished (images, or one unit where a stage has no parts).
     fn progress(&self, stage: Stage, done: usize, total: usize);
@@ -59,35 +59,35 @@ pub trait Observer: Sync {
     fn cancelled(&self) -> bool {
         false
     }
-    /// What an earlier run of this very mapping (equal input, options and program) found in an image.
-    fn recall(&self, _image: &str) -> Option<Found> {
+    /// The checkpoint of an image that an earlier run of the same mapping (equal input, options and program) saved.
+    fn load_checkpoint(&self, _image: &str) -> Option<Found> {
         None
     }
-    /// Told of what was found in an image, for a later run to recall.
-    fn found(&self, _found: &Found) {}
-    /// The structure that an earlier run of this very mapping fused of what was seen, which this is the digest of.
-    fn recall_structure(&self, _of: &str) -> Option<Fused> {
+    /// Saves what was found in an image, so that a later run need not search it again.
+    fn save_checkpoint(&self, _found: &Found) {}
+    /// The fused structure that an earlier run of the same mapping saved; `of` is the digest of the layouts it was fused from.
+    fn load_structure(&self, _of: &str) -> Option<Fused> {
         None
     }
-    /// Told of the structure that was fused, and the digest of what it was fused of, for a later run to recall.
-    fn structure(&self, _fused: &Fused, _of: &str) {}
-    /// Told which images are to be searched, in order, so that others may help. Their paths lie in the mapping's folder.
-    fn offer(&self, _images: &[Sought]) {}
-    /// What is next about the images that were offered: `left`, never empty, are those that were not given out here and
-    /// that nobody else has found something in, by their place among the offered, in order.
-    fn next(&self, left: &[usize]) -> Turn {
-        Turn::Search(left[0])
+    /// Saves the fused structure with the digest of the layouts it was fused from.
+    fn save_structure(&self, _fused: &Fused, _of: &str) {}
+    /// Publishes the images to be searched, in order, so that other workers may help. Their paths lie in the mapping's folder.
+    fn offer(&self, _images: &[ImageRequest]) {}
+    /// What to do next with the offered images. `left`, never empty, holds the indices of those that were neither searched here
+    /// nor finished by another worker, in order.
+    fn next(&self, left: &[usize]) -> NextImage {
+        NextImage::Search(left[0])
     }
 }
 
-/// What is next about the images of a mapping, by their place among those that were offered.
+/// What to do next with the offered images, by index.
 #[derive(Debug, Clone)]
-pub enum Turn {
-    /// This one is to be searched here.
+pub enum NextImage {
+    /// Search this one here.
     Search(usize),
-    /// Someone else has searched this one, as it would have been here.
+    /// Another worker has searched this one, with the same result as here.
     Found(usize, Box<Found>),
-    /// Others are at work on all that are left.
+    /// Other workers are searching all that are left.
     Wait,
 }
 
@@ -116,7 +116,7 @@ impl Clock<'_> {
     }
 }
 
-/// Highest resident memory of this process so far, bytes, where `/proc` tells it.
+/// Highest resident memory of this process so far, bytes, from `/proc`.
 fn peak_memory_bytes() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find(|line| line.starts_with("VmHWM:"))?;

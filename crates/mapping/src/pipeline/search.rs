@@ -1,4 +1,4 @@
-//! Images searched for modules and laid out, one after the other, whoever's mapping they are of.
+//! Detects the modules in images and lays them out, image by image; used by a mapping and by workers that help one.
 
 use super::{Found, MapError};
 use crate::detection::{Detector, ImageDetections};
@@ -12,29 +12,29 @@ use std::sync::mpsc::{SyncSender, sync_channel};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-/// Images that are searched at once: while one is measured out, the networks have the next.
+/// Images that are searched at once: while the boxes of one are measured, the networks run on the next.
 const IN_FLIGHT: usize = 2;
 
-/// An image that is to be searched, so that any process that has its file can.
+/// An image to be searched: all that a process with its file needs to know.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Sought {
+pub struct ImageRequest {
     /// The shot's name.
     pub image: String,
     /// The photo.
     pub path: PathBuf,
     /// The camera of the photo as it is, distorted or not.
     pub camera: Camera,
-    /// Metres on the ground per pixel, where the reconstruction tells.
+    /// Metres on the ground per pixel, where it is known.
     pub gsd_m: Option<f64>,
     /// Most pixels that the photo may have.
     pub max_pixels: u64,
 }
 
-impl Sought {
+impl ImageRequest {
     /// Decodes the photo, which lies at `path`, and undistorts it. H x W, 8-bit RGB.
     ///
     /// # Errors
-    /// A photo that is not what was sought, or does not decode.
+    /// A photo that differs from the request, or does not decode.
     pub fn load(&self, path: &Path) -> Result<RgbImage, MapError> {
         let header = crate::reconstruction::photo::inspect(path, &self.file_name(), self.max_pixels);
         let header = header.map_err(crate::reconstruction::ReadError::Photo)?;
@@ -49,7 +49,7 @@ impl Sought {
 
 /// An image that is searched next.
 pub struct Loaded<K> {
-    /// Tells this image from the others.
+    /// Identifies this image.
     pub key: K,
     /// The shot's name.
     pub image: String,

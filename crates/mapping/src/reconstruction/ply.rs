@@ -1,91 +1,24 @@
-//! Point clouds in PLY, ASCII or binary: positions, read as a stream and thinned as they come where there are very many.
-//! The size that a header promises is checked against the file before anything is allocated.
+//! Point clouds in PLY, ASCII or binary, as any producer writes them: positions, read as a stream and thinned as they come
+//! where there are very many. The size that a header promises is checked against the file before anything is allocated.
+
+mod header;
 
 use super::error::ReconstructionError;
 use crate::geometry::PointCloud;
 use crate::geometry::point_cloud::ThinningCloud;
+use header::{Element, Encoding, Header, Property, read_header};
 use std::fs::File;
-use std::io::{BufRead, BufReader, Read};
+use std::io::{self, BufRead, BufReader, Read};
 use std::path::Path;
 
 /// Most points that a file may promise.
 const MAX_POINTS: u64 = 2_000_000_000;
 /// Most points that are kept, a bound on memory (12 bytes each, and 16 while they are thinned).
-const MOST_KEPT: usize = 16_000_000;
-const MAX_HEADER_BYTES: usize = 64 * 1024;
-
-#[derive(Debug, Clone, Copy, PartialEq)]
-enum Encoding {
-    Ascii,
-    LittleEndian,
-    BigEndian,
-}
-
-#[derive(Debug, Clone, Copy)]
-enum Scalar {
-    I8,
-    U8,
-    I16,
-    U16,
-    I32,
-    U32,
-    F32,
-    F64,
-}
-
-impl Scalar {
-    fn parse(word: &str) -> Option<Self> {
-        Some(match word {
-            "char" | "int8" => Self::I8,
-            "uchar" | "uint8" => Self::U8,
-            "short" | "int16" => Self::I16,
-            "ushort" | "uint16" => Self::U16,
-            "int" | "int32" => Self::I32,
-            "uint" | "uint32" => Self::U32,
-            "float" | "float32" => Self::F32,
-            "double" | "float64" => Self::F64,
-            _ => return None,
-        })
-    }
-
-    fn size(self) -> usize {
-        match self {
-            Self::I8 | Self::U8 => 1,
-            Self::I16 | Self::U16 => 2,
-            Self::I32 | Self::U32 | Self::F32 => 4,
-            Self::F64 => 8,
-        }
-    }
-
-    /// The value of a field of a binary record (`bytes` has at least `size` bytes).
-    fn read(self, bytes: &[u8], big_endian: bool) -> f32 {
-        let mut field = [0_u8; 8];
-        let size = self.size();
-        field[..size].copy_from_slice(&bytes[..size]);
-        if big_endian {
-            field[..size].reverse();
-        }
-        match self {
-            Self::I8 => f32::from(field[0] as i8),
-            Self::U8 => f32::from(field[0]),
-            Self::I16 => f32::from(i16::from_le_bytes([field[0], field[1]])),
-            Self::U16 => f32::from(u16::from_le_bytes([field[0], field[1]])),
-            Self::I32 => i32::from_le_bytes([field[0], field[1], field[2], field[3]]) as f32,
-            Self::U32 => u32::from_le_bytes([field[0], field[1], field[2], field[3]]) as f32,
-            Self::F32 => f32::from_le_bytes([field[0], field[1], field[2], field[3]]),
-            Self::F64 => f64::from_le_bytes(field) as f32,
-        }
-    }
-}
-
-/// The vertex element as the header describes it.
-struct Header {
-    encoding: Encoding,
-    vertices: u64,
-    properties: Vec<(String, Scalar)>,
-    /// Where each of x, y, z stands among the properties.
-    fields: [usize; 3],
-}
+const MAX_KEPT: usize = 16_000_000;
+/// Most items of one list of one record: a vertex is seen by fewer views.
+const MAX_LIST_ITEMS: f64 = 1e6;
+/// Longest word of an ASCII file, bytes.
+const MAX_WORD_BYTES: usize = 400;
 
 /// Reads the vertices of a PLY file: positions in metres in the file's own frame. Points with a coordinate that is not
 /// finite are left out; of more than 16 million points one in each cube of a regular grid is kept.
@@ -97,54 +30,22 @@ pub fn read(path: &Path) -> Result<PointCloud, ReconstructionError> {
     let file = File::open(path).map_err(unreadable)?;
     let file_bytes = file.metadata().map_err(unreadable)?.len();
     let mut reader = BufReader::with_capacity(1 << 20, file);
-    let (header, header_bytes) = read_header(path, &mut reader)?;
-    if header.vertices == 0 {
-        return Err(ReconstructionError::EmptyCloud { path: path.to_owned() });
-    }
-    if header.vertices > MAX_POINTS {
-        return Err(ReconstructionError::CloudTooLarge {
-            path: path.to_owned(),
-            promised: header.vertices,
-            limit: MAX_POINTS,
-        });
-    }
-    let record_bytes: usize = header.properties.iter().map(|(_, scalar)| scalar.size()).sum();
-    // The least that a record takes: in ASCII one digit and one separator a property.
-    let least_bytes = match header.encoding {
-        Encoding::Ascii => 2 * header.properties.len() as u64,
-        _ => record_bytes as u64,
-    };
-    let held = (file_bytes - header_bytes + 1) / least_bytes;
-    if held < header.vertices {
-        return Err(ReconstructionError::TruncatedCloud { path: path.to_owned(), promised: header.vertices, held });
-    }
-    let mut thinning = ThinningCloud::new(MOST_KEPT, header.vertices as usize);
+    let header = read_header(path, &mut reader)?;
+    check_size(path, &header, file_bytes)?;
+    let mut thinning = ThinningCloud::new(MAX_KEPT, header.vertex.count as usize);
     let mut push = |position: [f32; 3]| {
         if position.iter().all(|value| value.is_finite()) {
             thinning.push(position);
         }
     };
     match header.encoding {
-        Encoding::Ascii => read_ascii(path, &mut reader, &header, &mut push)?,
+        Encoding::Ascii => read_records(path, &mut Words { reader }, &header, &mut push)?,
         encoding => {
-            let mut offsets = Vec::with_capacity(header.properties.len());
-            let mut offset = 0;
-            for (_, scalar) in &header.properties {
-                offsets.push((offset, *scalar));
-                offset += scalar.size();
-            }
-            let fields = header.fields.map(|index| offsets[index]);
-            let mut record = vec![0_u8; record_bytes];
-            for done in 0..header.vertices {
-                reader.read_exact(&mut record).map_err(|error| match error.kind() {
-                    std::io::ErrorKind::UnexpectedEof => ReconstructionError::TruncatedCloud {
-                        path: path.to_owned(),
-                        promised: header.vertices,
-                        held: done,
-                    },
-                    _ => unreadable(error),
-                })?;
-                push(fields.map(|(at, scalar)| scalar.read(&record[at..], encoding == Encoding::BigEndian)));
+            let mut fields = Fields { reader, big_endian: encoding == Encoding::BigEndian };
+            if header.vertex.record_bytes().is_some() && header.before.is_empty() {
+                fields.read_fixed(path, &header, &mut push)?;
+            } else {
+                read_records(path, &mut fields, &header, &mut push)?;
             }
         }
     }
@@ -155,114 +56,170 @@ pub fn read(path: &Path) -> Result<PointCloud, ReconstructionError> {
     Ok(cloud)
 }
 
-fn read_ascii(
-    path: &Path,
-    reader: &mut impl BufRead,
-    header: &Header,
-    push: &mut impl FnMut([f32; 3]),
-) -> Result<(), ReconstructionError> {
-    let mut line = Vec::new();
-    for done in 0..header.vertices {
-        line.clear();
-        let read = reader
-            .by_ref()
-            .take(MAX_HEADER_BYTES as u64)
-            .read_until(b'\n', &mut line)
-            .map_err(|source| ReconstructionError::Unreadable { path: path.to_owned(), source })?;
-        if read == 0 {
-            return Err(ReconstructionError::TruncatedCloud {
-                path: path.to_owned(),
-                promised: header.vertices,
-                held: done,
-            });
-        }
-        let malformed = || ReconstructionError::Malformed {
-            path: path.to_owned(),
-            what: format!("point {} does not hold {} numbers", done + 1, header.properties.len()),
-        };
-        let text = std::str::from_utf8(&line).map_err(|_| malformed())?;
-        let mut values = [0.0_f32; 3];
-        let mut words = 0;
-        for (index, word) in text.split_ascii_whitespace().enumerate() {
-            if let Some(slot) = header.fields.iter().position(|field| *field == index) {
-                values[slot] = word.parse().map_err(|_| malformed())?;
-            }
-            words = index + 1;
-        }
-        if words < header.properties.len() {
-            return Err(malformed());
-        }
-        push(values);
+/// Refuses a header that promises nothing, more than is read, or more than the file holds.
+fn check_size(path: &Path, header: &Header, file_bytes: u64) -> Result<(), ReconstructionError> {
+    let promised = header.vertex.count;
+    if promised == 0 {
+        return Err(ReconstructionError::EmptyCloud { path: path.to_owned() });
+    }
+    if promised > MAX_POINTS {
+        return Err(ReconstructionError::CloudTooLarge { path: path.to_owned(), promised, limit: MAX_POINTS });
+    }
+    // The last separator of an ASCII file may be missing.
+    let available = file_bytes - header.bytes + 1;
+    let min_bytes = |element: &Element| element.min_record_bytes(header.encoding).max(1);
+    let before = header
+        .before
+        .iter()
+        .fold(0_u64, |sum, element| sum.saturating_add(element.count.saturating_mul(min_bytes(element))));
+    let held = available.saturating_sub(before) / min_bytes(&header.vertex);
+    if held < promised {
+        return Err(ReconstructionError::TruncatedCloud { path: path.to_owned(), promised, held });
     }
     Ok(())
 }
 
-/// The header, and how many bytes it took.
-fn read_header(path: &Path, reader: &mut impl BufRead) -> Result<(Header, u64), ReconstructionError> {
-    let malformed = |what: String| ReconstructionError::Malformed { path: path.to_owned(), what };
-    let mut encoding = None;
-    let mut vertices = None;
-    let mut properties: Vec<(String, Scalar)> = Vec::new();
-    let mut elements = 0;
-    let mut consumed = 0;
-    let mut first = true;
-    loop {
-        let mut line = Vec::new();
-        reader
-            .by_ref()
-            .take((MAX_HEADER_BYTES - consumed.min(MAX_HEADER_BYTES)) as u64)
-            .read_until(b'\n', &mut line)
-            .map_err(|source| ReconstructionError::Unreadable { path: path.to_owned(), source })?;
-        consumed += line.len();
-        if line.last() != Some(&b'\n') {
-            return Err(malformed("the PLY header does not end".to_owned()));
-        }
-        let text = String::from_utf8_lossy(&line);
-        let words: Vec<&str> = text.split_ascii_whitespace().collect();
-        if first && words != ["ply"] {
-            return Err(malformed("it does not begin with `ply`".to_owned()));
-        }
-        first = false;
-        match words.as_slice() {
-            ["format", name, _] => {
-                encoding = Some(match *name {
-                    "ascii" => Encoding::Ascii,
-                    "binary_little_endian" => Encoding::LittleEndian,
-                    "binary_big_endian" => Encoding::BigEndian,
-                    other => return Err(malformed(format!("`{other}` is no PLY format"))),
-                });
+/// A source of the values of records, one after the other.
+trait Values {
+    /// The next value, as a property of this type has it.
+    fn next(&mut self, scalar: header::Scalar) -> io::Result<f64>;
+}
+
+/// The numbers of an ASCII file, whatever the line they stand on.
+struct Words<R> {
+    reader: R,
+}
+
+impl<R: BufRead> Values for Words<R> {
+    fn next(&mut self, _: header::Scalar) -> io::Result<f64> {
+        let mut word = [0_u8; MAX_WORD_BYTES];
+        let mut length = 0;
+        loop {
+            let buffer = self.reader.fill_buf()?;
+            if buffer.is_empty() {
+                break;
             }
-            ["element", name, count] => {
-                elements += 1;
-                if elements == 1 {
-                    if *name != "vertex" {
-                        return Err(malformed(format!("its first element is `{name}`, not `vertex`")));
-                    }
-                    vertices = Some(count.parse::<u64>().map_err(|_| malformed(format!("`{count}` is no count")))?);
+            let (mut used, mut ended) = (0, false);
+            for byte in buffer {
+                used += 1;
+                if !byte.is_ascii_whitespace() {
+                    *word.get_mut(length).ok_or_else(|| io::Error::from(io::ErrorKind::InvalidData))? = *byte;
+                    length += 1;
+                } else if length > 0 {
+                    ended = true;
+                    break;
                 }
             }
-            ["property", "list", ..] if elements == 1 => {
-                return Err(malformed("its vertices hold lists".to_owned()));
+            self.reader.consume(used);
+            if ended {
+                break;
             }
-            ["property", kind, name] if elements == 1 => {
-                let scalar = Scalar::parse(kind).ok_or_else(|| malformed(format!("`{kind}` is no PLY type")))?;
-                properties.push(((*name).to_owned(), scalar));
+        }
+        if length == 0 {
+            return Err(io::ErrorKind::UnexpectedEof.into());
+        }
+        let text = std::str::from_utf8(&word[..length]).ok();
+        text.and_then(|text| text.parse().ok()).ok_or_else(|| io::ErrorKind::InvalidData.into())
+    }
+}
+
+/// The fields of a binary file.
+struct Fields<R> {
+    reader: R,
+    big_endian: bool,
+}
+
+impl<R: Read> Values for Fields<R> {
+    fn next(&mut self, scalar: header::Scalar) -> io::Result<f64> {
+        let mut bytes = [0_u8; 8];
+        let size = scalar.size();
+        self.reader.read_exact(&mut bytes[..size])?;
+        Ok(scalar.read(&bytes, self.big_endian))
+    }
+}
+
+impl<R: Read> Fields<R> {
+    /// Reads vertices without lists: whole records at once.
+    fn read_fixed(
+        &mut self,
+        path: &Path,
+        header: &Header,
+        push: &mut impl FnMut([f32; 3]),
+    ) -> Result<(), ReconstructionError> {
+        let mut offsets = Vec::with_capacity(header.vertex.properties.len());
+        let mut size = 0;
+        for property in &header.vertex.properties {
+            if let Property::Scalar(scalar) = property {
+                offsets.push((size, *scalar));
+                size += scalar.size();
             }
-            ["end_header"] => break,
-            _ => {}
+        }
+        let fields = header.fields.map(|index| offsets[index]);
+        let mut record = vec![0_u8; size];
+        for done in 0..header.vertex.count {
+            self.reader.read_exact(&mut record).map_err(|error| broken(path, header, done, error))?;
+            push(fields.map(|(at, scalar)| scalar.read(&record[at..], self.big_endian) as f32));
+        }
+        Ok(())
+    }
+}
+
+/// Reads records value by value: those of the elements before the vertices are passed over.
+fn read_records(
+    path: &Path,
+    values: &mut impl Values,
+    header: &Header,
+    push: &mut impl FnMut([f32; 3]),
+) -> Result<(), ReconstructionError> {
+    for element in &header.before {
+        for _ in 0..element.count {
+            read_record(values, element, |_, _| {}).map_err(|error| broken(path, header, 0, error))?;
         }
     }
-    let place = |name: &str| properties.iter().position(|(property, _)| property == name);
-    let (Some(x), Some(y), Some(z)) = (place("x"), place("y"), place("z")) else {
-        return Err(malformed("its vertices have no x, y and z".to_owned()));
-    };
-    let header = Header {
-        encoding: encoding.ok_or_else(|| malformed("it names no format".to_owned()))?,
-        vertices: vertices.ok_or_else(|| malformed("it has no vertices".to_owned()))?,
-        fields: [x, y, z],
-        properties,
-    };
-    Ok((header, consumed as u64))
+    for done in 0..header.vertex.count {
+        let mut position = [0.0_f32; 3];
+        read_record(values, &header.vertex, |index, value| {
+            if let Some(slot) = header.fields.iter().position(|field| *field == index) {
+                position[slot] = value as f32;
+            }
+        })
+        .map_err(|error| broken(path, header, done, error))?;
+        push(position);
+    }
+    Ok(())
+}
+
+/// Reads one record; `scalar` takes the index and value of each property that is no list.
+fn read_record(values: &mut impl Values, element: &Element, mut scalar: impl FnMut(usize, f64)) -> io::Result<()> {
+    for (index, property) in element.properties.iter().enumerate() {
+        match property {
+            Property::Scalar(kind) => scalar(index, values.next(*kind)?),
+            Property::List { count, item } => {
+                let items = values.next(*count)?;
+                if !(0.0..=MAX_LIST_ITEMS).contains(&items) {
+                    return Err(io::ErrorKind::InvalidData.into());
+                }
+                for _ in 0..items as u64 {
+                    values.next(*item)?;
+                }
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Why a record could not be read, after `done` vertices.
+fn broken(path: &Path, header: &Header, done: u64, error: io::Error) -> ReconstructionError {
+    let path = path.to_owned();
+    match error.kind() {
+        io::ErrorKind::UnexpectedEof => {
+            ReconstructionError::TruncatedCloud { path, promised: header.vertex.count, held: done }
+        }
+        io::ErrorKind::InvalidData => {
+            ReconstructionError::Malformed { path, what: format!("point {} is not as its header describes", done + 1) }
+        }
+        _ => ReconstructionError::Unreadable { path, source: error },
+    }
 }
 
 #[cfg(test)]
@@ -332,5 +289,28 @@ mod tests {
             read(file(&ascii(1, "1 two 3 0 0 1 7\n")).path()),
             Err(ReconstructionError::Malformed { .. })
         ));
+    }
+
+    #[test]
+    fn lists_other_elements_and_wrapped_lines_are_read() {
+        let expected = [[1.5_f32, -2.0, 400.25], [3.0, 4.0, 401.0]];
+        let mut bytes = b"ply\nformat binary_little_endian 1.0\nelement camera 1\nproperty float view_px\nproperty list uchar int hull\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nproperty list uchar uint views\nproperty list uchar float weights\nend_header\n".to_vec();
+        bytes.extend(1.0_f32.to_le_bytes());
+        bytes.extend([1, 7, 0, 0, 0]);
+        for (point, views) in expected.iter().zip([2_u8, 0]) {
+            point.iter().for_each(|value| bytes.extend(value.to_le_bytes()));
+            bytes.push(views);
+            bytes.extend(vec![0; 4 * usize::from(views)]);
+            bytes.push(1);
+            bytes.extend(0.5_f32.to_le_bytes());
+        }
+        assert_eq!(read(file(&bytes).path()).unwrap().positions_m, expected);
+        bytes.truncate(bytes.len() - 3);
+        assert!(matches!(
+            read(file(&bytes).path()),
+            Err(ReconstructionError::TruncatedCloud { promised: 2, held: 1, .. })
+        ));
+        let wrapped = "\n1.5 -2\n 400.25 0 0 1 7 3 4 401 0 1\n\n0 9";
+        assert_eq!(read(file(&ascii(2, wrapped)).path()).unwrap().positions_m, expected);
     }
 }
