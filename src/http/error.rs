@@ -174,7 +174,7 @@ impl From<StoreError> for ApiError {
     fn from(error: StoreError) -> Self {
         match &error {
             StoreError::Gone { what: "plant" } => Self::new(Code::PlantNotFound, "the plant was deleted meanwhile"),
-            StoreError::OverQuota { what, used, quota } => super::usage::over_quota(what, *used, *quota),
+            StoreError::OverQuota { what, used, quota } => crate::http::controllers::usage::over_quota(what, *used, *quota),
             StoreError::TooManyUploads { open, most } => Self::new(
                 Code::TooManyUploads,
                 format!(
@@ -289,7 +289,7 @@ pub fn describe(description: &mut OpenApi) {
     }
 }
 
-pub(super) fn operations(item: &mut PathItem) -> impl Iterator<Item = (&'static str, &mut Operation)> {
+pub fn operations(item: &mut PathItem) -> impl Iterator<Item = (&'static str, &mut Operation)> {
     let PathItem { get, put, post, delete, patch, head, .. } = item;
     [("get", get), ("put", put), ("post", post), ("delete", delete), ("patch", patch), ("head", head)]
         .into_iter()
@@ -297,7 +297,7 @@ pub(super) fn operations(item: &mut PathItem) -> impl Iterator<Item = (&'static 
 }
 
 /// The codes that a text names in backticks.
-pub(super) fn named(text: &str) -> BTreeSet<Code> {
+pub fn named(text: &str) -> BTreeSet<Code> {
     let words: BTreeSet<&str> = text.split('`').skip(1).step_by(2).collect();
     Code::ALL.iter().copied().filter(|code| words.contains(code.parts().1)).collect()
 }

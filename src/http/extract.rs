@@ -1,6 +1,6 @@
 //! Path, query and body, with problem documents where they are wrong.
 
-use super::error::{ApiError, Code};
+use crate::http::error::{ApiError, Code};
 use axum::Json;
 use axum::extract::path::ErrorKind;
 use axum::extract::rejection::{JsonRejection, PathRejection, QueryRejection};

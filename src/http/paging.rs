@@ -1,6 +1,6 @@
 //! Lists in parts: a limit and a cursor, and a link to the next part.
 
-use super::error::{ApiError, Code};
+use crate::http::error::{ApiError, Code};
 use crate::store::Page;
 use axum::Json;
 use axum::http::{HeaderValue, header};

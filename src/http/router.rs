@@ -1,10 +1,15 @@
 //! The table of contents.
 
-use super::guard::{Gate, Policy};
-use super::{
-    AppState, admission, conditional, docs, encoding, error, events, examples, features, guard, health, idempotency,
-    images, jobs, keys, loopback, models, page, plants, surveys, tus, uploads, usage, webhooks,
+use super::controllers::{
+    events, features, files, health, images, jobs, keys, models, openapi as api_description, page, plants, surveys,
+    usage, webhooks,
 };
+use super::description::examples;
+use super::error;
+use super::middleware::access::{Gate, Policy};
+use super::middleware::{access, admission, conditional, encoding, idempotency, loopback};
+use super::state::AppState;
+use super::uploads::tus;
 use crate::config::NetworkArgs;
 use crate::telemetry::metrics::RequestLabels;
 use crate::telemetry::{Metrics, traces};
@@ -85,17 +90,17 @@ fn prompt() -> OpenApiRouter<AppState> {
         .routes(routes!(usage::get))
         .routes(routes!(health::health))
         .routes(routes!(health::ready))
-        .routes(routes!(docs::openapi_yaml))
-        .routes(routes!(docs::openapi_json))
+        .routes(routes!(api_description::openapi_yaml))
+        .routes(routes!(api_description::openapi_json))
 }
 
 /// Requests that take as long as their bytes come.
 fn uploads() -> OpenApiRouter<AppState> {
     OpenApiRouter::new()
-        .routes(routes!(uploads::put_image))
-        .routes(routes!(uploads::post_images))
-        .routes(routes!(uploads::put_reconstruction, uploads::post_reconstruction))
-        .routes(routes!(uploads::put_reconstruction_file))
+        .routes(routes!(files::put_image))
+        .routes(routes!(files::post_images))
+        .routes(routes!(files::put_reconstruction, files::post_reconstruction))
+        .routes(routes!(files::put_reconstruction_file))
         .routes(routes!(tus::begin::create, tus::list::list, tus::options))
         .routes(routes!(tus::head, tus::get, tus::append::patch, tus::terminate, tus::post))
 }
@@ -107,7 +112,7 @@ pub fn openapi() -> utoipa::openapi::OpenApi {
     // What a wildcard matches is a parameter like any other.
     let paths = std::mem::take(&mut description.paths.paths);
     description.paths.paths = paths.into_iter().map(|(path, item)| (path.replace("{*", "{"), item)).collect();
-    guard::describe(&mut description);
+    access::describe(&mut description);
     idempotency::describe(&mut description);
     conditional::describe(&mut description);
     error::describe(&mut description);
@@ -128,7 +133,7 @@ pub fn router(state: AppState) -> Router {
     router
         .route_layer(middleware::from_fn(conditional::conditional))
         .route_layer(middleware::from_fn_with_state(state.clone(), idempotency::once))
-        .route_layer(middleware::from_fn_with_state(gate, guard::guard))
+        .route_layer(middleware::from_fn_with_state(gate, access::guard))
         .route_layer(middleware::from_fn_with_state(metrics, count))
         .fallback(page::serve)
         .method_not_allowed_fallback(|| async { StatusCode::METHOD_NOT_ALLOWED })
@@ -224,7 +229,7 @@ async fn sane_request_id(mut request: Request, next: Next) -> Response {
 }
 
 fn span(request: &axum::http::Request<Body>) -> Span {
-    let (id, method, path) = (guard::request_id(request), request.method(), request.uri().path());
+    let (id, method, path) = (access::request_id(request), request.method(), request.uri().path());
     if !traces::are_on() {
         return tracing::info_span!("request", %method, path, id);
     }

@@ -1,7 +1,7 @@
 //! Connections, within bounds of number and time: who sends nothing, or takes nothing of what is sent, is let go.
 
-use super::rates::network;
 use crate::config::Limits;
+use crate::http::middleware::rates::network;
 use axum::Router;
 use hyper::server::conn::http1;
 use hyper_util::rt::{TokioIo, TokioTimer};

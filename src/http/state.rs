@@ -1,9 +1,9 @@
 //! What every handler may use.
 
-use super::error::{ApiError, Code};
-use super::rates::Rates;
-use super::tus::Desk;
 use crate::config::{Limits, NetworkArgs};
+use crate::http::error::{ApiError, Code};
+use crate::http::middleware::rates::Rates;
+use crate::http::uploads::tus::Desk;
 use crate::jobs::PipelineMapper;
 use crate::oidc::Oidc;
 use crate::store::{Blobs, Plant, Store, Survey, SurveyId};

@@ -1,0 +1,4 @@
+//! Bytes that come in: received and checked (`intake`), whole or by the tus protocol.
+
+pub mod intake;
+pub mod tus;
