@@ -13,16 +13,16 @@ ONNXRUNTIME_VERSION := 1.31.1
 ORT_LIBRARY := .ort/libonnxruntime.so
 export ORT_DYLIB_PATH ?= $(abspath $(ORT_LIBRARY))
 
-# Where the data sets lie that are too large for the repository; tests that need one say so when they skip.
+# Folder of the data sets that are too large for the repository; tests that need one report that they skip without it.
 HELIOMAP_DATA ?= $(abspath $(wildcard ../shared/data))
 export HELIOMAP_DATA
 
-.PHONY: help setup web demo test lint unit client kills tus contract query load scale-out tenants deploy-lint fuzz structure bench scaling yolo-export openapi configuration clean
+.PHONY: help setup web demo test lint format deny unit page client kills tus contract query load scale-out tenants deploy-lint fuzz structure bench scaling yolo-export openapi configuration clean
 
 help: ## List the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
-setup: $(ORT_LIBRARY) web/dist/index.html ## Install what is missing: ONNX Runtime, and the web page's build
+setup: $(ORT_LIBRARY) web/dist/index.html ## Fetch ONNX Runtime and build the web page, if missing
 
 $(ORT_LIBRARY):
 	@echo "fetching ONNX Runtime $(ONNXRUNTIME_VERSION)"
@@ -35,8 +35,8 @@ $(ORT_LIBRARY):
 
 web: web/dist/index.html ## Build the web page
 
-web/dist/index.html: $(wildcard web/src/* web/src/*/* web/*.html web/package-lock.json web/vite.config.ts)
-	@cd web && $(NPM) ci --no-audit --no-fund --loglevel=error && $(NPM) run build --silent
+web/dist/index.html: web/node_modules/done $(wildcard web/src/* web/src/*/* web/*.html web/vite.config.ts)
+	@cd web && $(NPM) run build --silent
 
 demo: setup ## Map the example plant through the HTTP service and check it (KEEP=1 leaves the service running)
 	$(CARGO) build --release --locked
@@ -44,13 +44,44 @@ demo: setup ## Map the example plant through the HTTP service and check it (KEEP
 
 test: lint unit ## Run all tests
 
-lint: setup ## Formatting and lints, warnings are errors
+lint: .venv/lint/done web/node_modules/done ## Formatting and lints of Rust, Python and TypeScript; warnings are errors
 	$(CARGO) fmt --all --check
+	.venv/lint/bin/ruff check --quiet
+	.venv/lint/bin/ruff format --check --quiet
+	cd web && npx --no-install biome ci --colors=off --error-on-warnings
+	$(PYTHON) .ci/dependencies.py
 	$(CARGO) clippy --locked --workspace --all-targets -- --deny warnings
 
+format: .venv/lint/done web/node_modules/done ## Format Rust, Python and TypeScript, and apply the linters' safe fixes
+	$(CARGO) fmt --all
+	.venv/lint/bin/ruff check --fix --quiet
+	.venv/lint/bin/ruff format --quiet
+	cd web && npx --no-install biome check --write --colors=off
+
+.venv/lint/done: .ci/requirements.txt
+	@$(PYTHON) -m venv .venv/lint && .venv/lint/bin/pip install --quiet --disable-pip-version-check --requirement $<
+	@touch $@
+
+web/node_modules/done: web/package-lock.json
+	@cd web && $(NPM) ci --no-audit --no-fund --loglevel=error
+	@touch $@
+
+CARGO_DENY_VERSION := 0.20.2
+deny: .cargo-deny/bin/cargo-deny ## Check dependencies by deny.toml: advisories (needs a network), bans, licences, sources
+	.cargo-deny/bin/cargo-deny --locked check
+
+.cargo-deny/bin/cargo-deny:
+	$(CARGO) install cargo-deny --version $(CARGO_DENY_VERSION) --locked --quiet --root .cargo-deny
+
+# Tests that need Postgres or an S3-compatible server are ignored by plain `cargo test`; both servers are started here.
 unit: setup .venv/s3/done ## Tests alone
-	tests/with-postgres.sh tests/with-s3.sh $(CARGO) test --locked --workspace
-	$(MAKE) --no-print-directory client
+	tests/with-postgres.sh tests/with-s3.sh bash -c '$(CARGO) test --locked --workspace && \
+	  $(CARGO) test --locked --workspace --test store --test server -- --ignored'
+	$(MAKE) --no-print-directory page client
+
+page: web/dist/index.html ## Use the web page in Chromium
+	@command -v chromium >/dev/null || { apt-get update -qq && apt-get install -qq --yes --no-install-recommends chromium >/dev/null; }
+	cd web && $(NPM) run smoke --silent
 
 client: setup ## The Python client and every command of docs/API.md against the real service
 	@command -v jq >/dev/null || { apt-get update -qq && apt-get install -qq --yes --no-install-recommends jq >/dev/null; }
@@ -62,13 +93,13 @@ client: setup ## The Python client and every command of docs/API.md against the 
 	@touch $@
 
 KILLS ?= 200
-kills: setup ## Kill server and worker at random (KILLS times, half of them on Postgres): nothing is lost, models are the same
+kills: setup ## Kill server and worker at random KILLS times, half of them on Postgres; no data may be lost or differ
 	$(CARGO) test --locked --no-run
 	$(PYTHON) tests/kills/kills.py --binary target/debug/heliomap --kills $$(( $(KILLS) / 2 ))
 	tests/with-postgres.sh bash -c '$(PYTHON) tests/kills/kills.py --binary target/debug/heliomap \
 	  --kills $$(( $(KILLS) - $(KILLS) / 2 )) --seed 2 --database "$$HELIOMAP_TEST_POSTGRES/postgres"'
 
-tus: setup .venv/tus/done tests/tus/node_modules/done ## Upload 1 GB by two tus clients through 20 disconnects and a kill: the bytes agree
+tus: setup .venv/tus/done tests/tus/node_modules/done ## Upload 1 GB with two tus clients through 20 disconnects and a kill; compare the bytes
 	$(CARGO) build --locked
 	.venv/tus/bin/python tests/tus/tus.py --binary target/debug/heliomap
 
@@ -88,21 +119,21 @@ contract: setup .venv/contract/done ## Run schemathesis with all checks on opena
 	@$(PYTHON) -m venv .venv/contract && .venv/contract/bin/pip install --quiet --disable-pip-version-check --requirement $<
 	@touch $@
 
-query: setup ## How fast a dashboard is answered about a plant of a million modules, on SQLite and on Postgres
+query: setup ## Measure dashboard queries on a plant of a million modules, on SQLite and on Postgres
 	$(CARGO) build --release --locked
 	HELIOMAP_BINARY=target/release/heliomap $(PYTHON) tests/query/query.py
 	HELIOMAP_BINARY=target/release/heliomap tests/with-postgres.sh \
 	  bash -c '$(PYTHON) tests/query/query.py --database "$$HELIOMAP_TEST_POSTGRES/postgres"'
 
-load: setup ## 50 clients upload at once beside 200 dashboard requests per second: no error, quick answers, little memory
+load: setup ## Measure errors, response times and memory with 50 uploading clients and 200 dashboard requests per second
 	$(CARGO) build --release --locked
 	HELIOMAP_BINARY=target/release/heliomap $(PYTHON) tests/load/load.py
 
-scale-out: setup .venv/s3/done ## Two workers on one core each against one, over Postgres and S3 in network namespaces; then one is cut off
+scale-out: setup .venv/s3/done ## Compare two workers with one, over Postgres and S3 in network namespaces; then cut one off
 	$(CARGO) build --release --locked
 	$(PYTHON) tests/scale/scale_out.py
 
-tenants: setup ## One organisation's key tries every operation on another's objects: 404 everywhere
+tenants: setup ## Try every operation with the key of another organisation: every response must be 404
 	$(CARGO) test --locked --test http tenants -- --nocapture
 
 deploy-lint: .venv/deploy/done ## Lint the Dockerfile, compose.yaml and the Helm chart
@@ -112,13 +143,13 @@ deploy-lint: .venv/deploy/done ## Lint the Dockerfile, compose.yaml and the Helm
 	@$(PYTHON) -m venv .venv/deploy && .venv/deploy/bin/pip install --quiet --disable-pip-version-check --requirement $<
 	@touch $@
 
-# Nightly Rust and a workspace of its own: nothing else builds it. What is found is added to a copy of the corpora.
+# Needs nightly Rust and is a workspace of its own. New inputs go into a copy of the corpora.
 CARGO_FUZZ_VERSION := 0.13.2
 FUZZ_SECONDS ?= 600
 FUZZ_TARGETS ?= ply reconstruction archive photo tus query
 FUZZ_BOUNDS := -timeout=10 -rss_limit_mb=1024 -max_len=65536
 
-fuzz: web .cargo-fuzz/bin/cargo-fuzz ## Fuzz every parser of what comes in, FUZZ_SECONDS each: no crash, no hang, bounded memory
+fuzz: web .cargo-fuzz/bin/cargo-fuzz ## Fuzz every parser of untrusted input, FUZZ_SECONDS each: no crash, no hang, bounded memory
 	@for target in $(FUZZ_TARGETS); do \
 	  mkdir -p target/fuzz-corpus/$$target; \
 	  PATH="$(CURDIR)/.cargo-fuzz/bin:$$PATH" $(CARGO) +nightly fuzz run $$target target/fuzz-corpus/$$target fuzz/corpus/$$target \
@@ -128,16 +159,16 @@ fuzz: web .cargo-fuzz/bin/cargo-fuzz ## Fuzz every parser of what comes in, FUZZ
 .cargo-fuzz/bin/cargo-fuzz:
 	@$(CARGO) install cargo-fuzz --version $(CARGO_FUZZ_VERSION) --locked --quiet --root .cargo-fuzz
 
-structure: setup ## Survey of many simulated plants of every kind, on all cores; fails where too few come out exactly
+structure: setup ## Map many simulated plants of every kind, on all cores; fails when too few are exact
 	$(CARGO) test --release --locked --no-fail-fast --package heliomap-mapping --test structure -- --ignored --nocapture --test-threads 1
 
 bench: setup ## Benchmarks of layout, locate, fusion and refinement
 	$(CARGO) bench --locked --package heliomap-mapping --bench structure
 
-scaling: setup ## Time and memory over the size of the plant, to a million modules, with a plot in target/scaling
+scaling: setup ## Measure time and memory for plants of up to a million modules; plot in target/scaling
 	$(CARGO) bench --locked --package heliomap-mapping --bench scaling
 
-# Of its own, because the package and PyTorch are large. Its licence is AGPL: nothing of it is kept.
+# Separate because the package and PyTorch are large. The package is under the AGPL, so nothing of it is kept.
 ULTRALYTICS_VERSION := 8.4.190
 YOLO_CHECK := target/yolo-export
 
@@ -154,11 +185,11 @@ yolo-export: setup ## Build and export an untrained network of the YOLOv8-seg fa
 	done
 	rm -rf $(YOLO_CHECK)
 
-openapi: ## Write openapi.yaml anew from the code
+openapi: ## Regenerate openapi.yaml from the code
 	$(CARGO) run --locked --quiet -- openapi > openapi.yaml.new && mv openapi.yaml.new openapi.yaml
 
-configuration: ## Write docs/CONFIGURATION.md anew from the command line
+configuration: ## Regenerate docs/CONFIGURATION.md from the command line
 	$(CARGO) run --locked --quiet -- configuration > CONFIGURATION.md.new && mv CONFIGURATION.md.new docs/CONFIGURATION.md
 
-clean: ## Remove everything that was built or fetched
-	rm -rf target .ort .venv .cargo-fuzz fuzz/target web/dist web/node_modules tests/tus/node_modules
+clean: ## Remove all build outputs and fetched files
+	rm -rf target .ort .venv .cargo-deny .cargo-fuzz fuzz/target web/dist web/node_modules tests/tus/node_modules

@@ -28,10 +28,20 @@ VALUES = {
         "image": {"tag": "1.2.3"},
         "imagePullSecrets": [{"name": "registry"}],
         "ingress": {"enabled": True, "className": "nginx", "tlsSecret": "tls", "annotations": {"a": "b"}},
-        "server": {"replicas": 3, "storage": {"className": "fast"}, "nodeSelector": {"disk": "ssd"}, "env": {"A": "1"},
-                   "tolerations": [{"operator": "Exists"}], "affinity": {"podAntiAffinity": {}}},
+        "server": {
+            "replicas": 3,
+            "storage": {"className": "fast"},
+            "nodeSelector": {"disk": "ssd"},
+            "env": {"A": "1"},
+            "tolerations": [{"operator": "Exists"}],
+            "affinity": {"podAntiAffinity": {}},
+        },
         "serviceAccount": {"annotations": {"role": "r"}},
-        "worker": {"nodeSelector": {"gpu": "no"}, "tolerations": [{"operator": "Exists"}], "affinity": {"nodeAffinity": {}}},
+        "worker": {
+            "nodeSelector": {"gpu": "no"},
+            "tolerations": [{"operator": "Exists"}],
+            "affinity": {"nodeAffinity": {}},
+        },
     },
     "roles in place of keys": {"blobs": {"existingSecret": ""}, "metrics": {"scrapeAnnotations": False}},
     "a Prometheus with labels of its own": {"autoscaling": {"enabled": True, "matchers": 'app="demo"'}},
@@ -43,10 +53,20 @@ VALUES = {
 BEHIND_PROXY = ("everything on", "a gateway in front", "a proxy by the environment")
 #: Pods of the release that is rendered here, and of others in its namespace.
 OWN_PODS = ("demo-heliomap-server-0", "demo-heliomap-server-12", "demo-heliomap-worker-7c9f8d6b5-x2x4z")
-OTHER_PODS = ("heliomap-server-0", "other-demo-heliomap-server-0", "demo-heliomap-worker-b-server-0", "demo-heliomap-2-server-0")
+OTHER_PODS = (
+    "heliomap-server-0",
+    "other-demo-heliomap-server-0",
+    "demo-heliomap-worker-b-server-0",
+    "demo-heliomap-2-server-0",
+)
 #: Values that the chart's schema refuses.
-REFUSED = ({"blobs": {"url": "https://bucket"}}, {"database": {"existingSecret": ""}}, {"server": {"replicas": 0}}, {"typo": 1},
-           {"server": {"behindProxy": "yes"}})
+REFUSED = (
+    {"blobs": {"url": "https://bucket"}},
+    {"database": {"existingSecret": ""}},
+    {"server": {"replicas": 0}},
+    {"typo": 1},
+    {"server": {"behindProxy": "yes"}},
+)
 
 
 def merged(base: dict, more: dict) -> dict:
@@ -68,7 +88,11 @@ def secure(name: str, pod: dict) -> list[str]:
         wrongs.append(f"{name} may run as root")
     for container in pod["containers"]:
         security = container["securityContext"]
-        if security["allowPrivilegeEscalation"] or not security["readOnlyRootFilesystem"] or security["capabilities"]["drop"] != ["ALL"]:
+        if (
+            security["allowPrivilegeEscalation"]
+            or not security["readOnlyRootFilesystem"]
+            or security["capabilities"]["drop"] != ["ALL"]
+        ):
             wrongs.append(f"{name} may do more than it needs to")
         if not container["resources"].get("limits", {}).get("memory"):
             wrongs.append(f"{name} has no limit of memory")
@@ -108,7 +132,11 @@ def check_chart() -> list[str]:
     defaults = yaml.safe_load((CHART / "values.yaml").read_text())
     result = helm.lint(CHART)
     messages = result.get("messages") or []
-    wrongs += [f"helm lint: {message}" for message in messages if str(message.get("severity", "")).upper() in ("WARNING", "ERROR")]
+    wrongs += [
+        f"helm lint: {message}"
+        for message in messages
+        if str(message.get("severity", "")).upper() in ("WARNING", "ERROR")
+    ]
     wrongs += [f"helm lint: {error}" for error in result.get("errors") or []]
     kinds = set()
     with helm.Chart.load(CHART) as chart:
@@ -136,7 +164,9 @@ def check_chart() -> list[str]:
                             wrongs.append(f"{title}, {kind} {name}, Kubernetes {version}: {error}")
                     if kind in ("Deployment", "StatefulSet"):
                         wrongs += secure(f"{title}, {kind} {name}:", document["spec"]["template"]["spec"])
-                    if kind == "StatefulSet" and behind_proxy(document["spec"]["template"]["spec"]) != (title in BEHIND_PROXY):
+                    if kind == "StatefulSet" and behind_proxy(document["spec"]["template"]["spec"]) != (
+                        title in BEHIND_PROXY
+                    ):
                         wrongs.append(f"{title}, {kind} {name}: clients' addresses are taken from the wrong place")
         for values in REFUSED:
             try:
@@ -144,7 +174,15 @@ def check_chart() -> list[str]:
             except helm.HelmError:
                 continue
             wrongs.append(f"the chart takes {values}")
-    expected = {"StatefulSet", "Deployment", "Service", "ServiceAccount", "Ingress", "ScaledObject", "PodDisruptionBudget"}
+    expected = {
+        "StatefulSet",
+        "Deployment",
+        "Service",
+        "ServiceAccount",
+        "Ingress",
+        "ScaledObject",
+        "PodDisruptionBudget",
+    }
     wrongs += [f"no {kind} was rendered" for kind in sorted(expected - kinds)]
     return wrongs
 
@@ -152,8 +190,15 @@ def check_chart() -> list[str]:
 def check_steps() -> list[str]:
     """The Dockerfile takes its steps from make, and names the Rust and the models that are used everywhere else."""
     text = (ROOT / "Dockerfile").read_text()
-    return [f"the Dockerfile does not {step}" for step in
-            ("RUN make web", "RUN make .ort/libonnxruntime.so", "RUN cargo build --release --locked --bin heliomap") if step not in text]
+    return [
+        f"the Dockerfile does not {step}"
+        for step in (
+            "RUN make web",
+            "RUN make .ort/libonnxruntime.so",
+            "RUN cargo build --release --locked --bin heliomap",
+        )
+        if step not in text
+    ]
 
 
 def main() -> int:
@@ -162,8 +207,10 @@ def main() -> int:
     wrongs += check_steps() + check_chart()
     for wrong in wrongs:
         print(f"WRONG: {wrong}")
-    print(f"Dockerfile, compose.yaml and the Helm chart ({len(VALUES)} sets of values, Helm {helm.helm_sdk_version()}): "
-          f"{len(wrongs)} wrong")
+    print(
+        f"Dockerfile, compose.yaml and the Helm chart ({len(VALUES)} sets of values, Helm {helm.helm_sdk_version()}): "
+        f"{len(wrongs)} wrong"
+    )
     return 1 if wrongs else 0
 
 

@@ -66,7 +66,9 @@ def bar(name: str, done: int, total: int) -> None:
     """A progress bar on a terminal, a line per step elsewhere."""
     if TERMINAL:
         filled = 30 * done // max(total, 1)
-        print(f"\r  {name:<10} [{'=' * filled}{' ' * (30 - filled)}] {done}/{total} ", end="", file=sys.stderr, flush=True)
+        print(
+            f"\r  {name:<10} [{'=' * filled}{' ' * (30 - filled)}] {done}/{total} ", end="", file=sys.stderr, flush=True
+        )
         if done == total:
             print(file=sys.stderr)
     else:
@@ -99,9 +101,21 @@ def start_service(binary: Path, keep: bool) -> tuple[subprocess.Popen, str]:
     subprocess.run(["rm", "-rf", str(data)], check=True)
     log = open(OUT / "service.log", "w")
     service = subprocess.Popen(
-        [str(binary), "serve", "--insecure", "--listen", f"127.0.0.1:{port_for(keep)}", "--data-dir", str(data),
-         "--detector", f"{ROOT}/models/unet.onnx,{ROOT}/models/yolo.onnx"],
-        stdout=subprocess.PIPE, stderr=log, text=True, start_new_session=True,
+        [
+            str(binary),
+            "serve",
+            "--insecure",
+            "--listen",
+            f"127.0.0.1:{port_for(keep)}",
+            "--data-dir",
+            str(data),
+            "--detector",
+            f"{ROOT}/models/unet.onnx,{ROOT}/models/yolo.onnx",
+        ],
+        stdout=subprocess.PIPE,
+        stderr=log,
+        text=True,
+        start_new_session=True,
     )
     line = service.stdout.readline()
     address = next((word.rstrip("/") for word in line.split() if word.startswith("http://")), None)
@@ -120,7 +134,7 @@ def upload(api: Api) -> str:
     api.put_file(f"{survey}/images/{photos[0].name}", photos[0])
     bar("photos", 1, len(photos))
     for at in range(1, len(photos), 3):
-        api.post_files(f"{survey}/images", photos[at:at + 3])
+        api.post_files(f"{survey}/images", photos[at : at + 3])
         bar("photos", min(at + 3, len(photos)), len(photos))
     files = [EXAMPLE / "reconstruction.json", EXAMPLE / "reference_lla.json"]
     files += [file for file in sorted((EXAMPLE / "undistorted").rglob("*")) if file.is_file()]
@@ -182,8 +196,15 @@ def main() -> None:
             print(f"  {len(collection['features'])} {layer}: {OUT.relative_to(ROOT) / (layer + '.geojson')}")
         print("checking against the truth", flush=True)
         check = subprocess.run(
-            [str(binary), "evaluate", str(OUT / "modules.geojson"), str(EXAMPLE / "truth.json"), "--strict",
-             "--plots", str(OUT / "plots")],
+            [
+                str(binary),
+                "evaluate",
+                str(OUT / "modules.geojson"),
+                str(EXAMPLE / "truth.json"),
+                "--strict",
+                "--plots",
+                str(OUT / "plots"),
+            ],
             check=False,
         )
         if check.returncode != 0:
@@ -193,7 +214,9 @@ def main() -> None:
             pid_file.write_text(str(service.pid))
             print(f"\nLook at the plant: {address}/ (stop the service with: kill {service.pid})")
         else:
-            print("\nThe plant is in out/demo; `make demo KEEP=1` leaves the service running so that you can look at it.")
+            print(
+                "\nThe plant is in out/demo; `make demo KEEP=1` leaves the service running so that you can look at it."
+            )
     finally:
         if not kept:
             service.terminate()

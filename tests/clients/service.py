@@ -25,7 +25,9 @@ class Service:
         if database:
             self.environment["HELIOMAP_DATABASE"] = database
         create = [str(BINARY), "keys", "create", "--name", "test", "--scope", "admin"]
-        self.key = subprocess.run(create, env=self.environment, check=True, capture_output=True, text=True).stdout.strip()
+        self.key = subprocess.run(
+            create, env=self.environment, check=True, capture_output=True, text=True
+        ).stdout.strip()
         self.arguments = arguments
         self.listen = "127.0.0.1:0"
         self.start()

@@ -17,9 +17,9 @@ from pathlib import Path
 from service import ROOT, Service, lay_out_example
 
 sys.path.insert(0, str(ROOT / "clients" / "python"))
-from heliomap_client import Client, Problem, Unreachable, survey_files  # noqa: E402
-from heliomap_client import upload as uploading  # noqa: E402
-from heliomap_client.cli import main  # noqa: E402
+from heliomap_client import Client, Problem, Unreachable, survey_files
+from heliomap_client import upload as uploading
+from heliomap_client.cli import main
 
 
 class ClientTest(unittest.TestCase):
@@ -64,7 +64,9 @@ class ClientTest(unittest.TestCase):
         first = client.upload_folder(plant, here, survey)
         files = dict(survey_files(survey))
         self.assertEqual(len(first.stored), len(files) - 1)
-        self.assertEqual({path: problem.code for path, problem in first.refused.items()}, {"images/broken.jpg": "image_unreadable"})
+        self.assertEqual(
+            {path: problem.code for path, problem in first.refused.items()}, {"images/broken.jpg": "image_unreadable"}
+        )
         self.assertEqual(first.warned, [])
         again = client.upload_folder(plant, here, survey)
         self.assertEqual((again.stored, again.skipped), ([], len(files) - 1))
@@ -89,7 +91,11 @@ class ClientTest(unittest.TestCase):
         state = survey / uploading.STATE_FILE
         digest = hashlib.sha256(cloud.read_bytes()).hexdigest()
         place = f"/api/v1/plants/{plant}/surveys/{here}"
-        headers = {**uploading.TUS, "Upload-Length": str(cloud.stat().st_size), "Upload-Metadata": "path dW5kaXN0b3J0ZWQvZGVwdGhtYXBzL21lcmdlZC5wbHk="}
+        headers = {
+            **uploading.TUS,
+            "Upload-Length": str(cloud.stat().st_size),
+            "Upload-Metadata": "path dW5kaXN0b3J0ZWQvZGVwdGhtYXBzL21lcmdlZC5wbHk=",
+        }
         with client.open("POST", f"{place}/uploads", headers=headers, body=lambda: b"") as answer:
             url = answer.headers["Location"]
         begun = 5 << 20
@@ -108,7 +114,9 @@ class ClientTest(unittest.TestCase):
         killer.join()
         self.assertEqual([file["sha256"] for file in report.stored], [digest])
         self.assertFalse(state.exists())
-        self.assertEqual(client.open("HEAD", url, headers=uploading.TUS).headers["Upload-Offset"], str(cloud.stat().st_size))
+        self.assertEqual(
+            client.open("HEAD", url, headers=uploading.TUS).headers["Upload-Offset"], str(cloud.stat().st_size)
+        )
 
     def test_a_key_for_one_plant_does_what_it_is_for_and_no_plant_is_made_by_mistake(self) -> None:
         client = self.client("--no-worker")
@@ -131,7 +139,11 @@ class ClientTest(unittest.TestCase):
         self.assertEqual((status, "read" in told, "stored" in told), (1, True, False), told)
         self.assertEqual(run("upload", "upload", str(survey), *here)[0], 0)
         self.assertEqual(run("upload", "start", *here)[0], 0)
-        for name, why in (("Sunfield", "model_not_found"), ("Sunfeld", "no plant of the name"), ("Sunfield North", "no plant")):
+        for name, why in (
+            ("Sunfield", "model_not_found"),
+            ("Sunfeld", "no plant of the name"),
+            ("Sunfield North", "no plant"),
+        ):
             status, told = run("read", "fetch", "--plant", name, "--out", str(target))
             self.assertEqual((status, why in told), (1, True), told)
         status, told = run("upload", "start", "--plant", "Sunfield", "--survey", "Jun")

@@ -63,7 +63,7 @@ class Process:
     def __init__(self, name: str, command: list[str], folder: Path):
         self.name, self.command = name, command
         self.log = open(folder / f"{name}.log", "ab")
-        self.read = open(folder / f"{name}.log", "r", errors="replace")
+        self.read = open(folder / f"{name}.log", errors="replace")
         self.rest = ""
         self.child: subprocess.Popen | None = None
         #: The stages that it began since it was started, with the times; the last is `None` where it has no job.
@@ -294,14 +294,32 @@ def main() -> int:
     folder = Path(tempfile.mkdtemp(prefix="heliomap-kills-"))
     data = folder / "data"
     port = free_port()
-    store = ["--data-dir", str(data), "--keep-replaced", "0.1"] + (["--database", args.database] if args.database else [])
+    store = ["--data-dir", str(data), "--keep-replaced", "0.1"] + (
+        ["--database", args.database] if args.database else []
+    )
     # Every kill counts as an attempt: the limit must not end a job here.
     lives = ["--max-attempts", str(1000 + args.kills)]
     hooks = ["--webhook-private-targets"]
-    server = Process("server", [str(args.binary), "serve", "--insecure", "--no-worker", "--listen",
-                                f"127.0.0.1:{port}", *store, *lives, *hooks], folder)
-    worker = Process("worker", [str(args.binary), "worker", "--lease", "2", "--detector",
-                                str(ROOT / "models" / "unet.onnx"), *store, *hooks], folder)
+    server = Process(
+        "server",
+        [
+            str(args.binary),
+            "serve",
+            "--insecure",
+            "--no-worker",
+            "--listen",
+            f"127.0.0.1:{port}",
+            *store,
+            *lives,
+            *hooks,
+        ],
+        folder,
+    )
+    worker = Process(
+        "worker",
+        [str(args.binary), "worker", "--lease", "2", "--detector", str(ROOT / "models" / "unet.onnx"), *store, *hooks],
+        folder,
+    )
     api = Api(f"http://127.0.0.1:{port}/api/v1")
     receiver = Receiver()
     kills: Counter[tuple[str, str]] = Counter()
@@ -322,16 +340,18 @@ def main() -> int:
         expected = quiet.model()
         ended.append(quiet)
         lengths = worker.lengths()
-        log(f"without kills: {quiet_s:.1f} s from the first byte to the model, {len(expected['modules'])} bytes of modules")
+        log(
+            f"without kills: {quiet_s:.1f} s from the first byte to the model, {len(expected['modules'])} bytes of modules"
+        )
         while sum(kills.values()) < args.kills:
             rounds += 1
             current = Round(api, f"round {rounds}")
             failed: list[BaseException] = []
 
-            def run() -> None:
+            def run(current: Round = current, failed: list[BaseException] = failed) -> None:
                 try:
                     current.run()
-                except BaseException as error:  # noqa: BLE001: it is told below
+                except BaseException as error:
                     failed.append(error)
 
             client = threading.Thread(target=run, daemon=True)
@@ -359,7 +379,10 @@ def main() -> int:
             if not failed:
                 ended.append(current)
             state = "failed" if failed else f"{current.job['state']} at attempt {current.job['attempt']}"
-            log(f"round {rounds}: {sum(kills.values())} kills so far, job {state}" + "".join(f"\n  WRONG: {w}" for w in wrongs))
+            log(
+                f"round {rounds}: {sum(kills.values())} kills so far, job {state}"
+                + "".join(f"\n  WRONG: {w}" for w in wrongs)
+            )
         last = [f"{one.name}: {wrong}" for one in ended for wrong in one.wrongs(data, expected)]
         last += told_wrongs(api, hook, receiver, ended)
         if args.kills >= MANY:
@@ -367,8 +390,10 @@ def main() -> int:
             last += [f"no kill came in {stage}" for stage in ("upload", "queue", *STAGES) if stage not in hit]
         failures += last
         different = len({message["id"] for message in receiver.messages})
-        log(f"at the end: {len(ended)} jobs, {len(receiver.messages)} messages, {different} of them different"
-            + "".join(f"\n  WRONG: {wrong}" for wrong in last))
+        log(
+            f"at the end: {len(ended)} jobs, {len(receiver.messages)} messages, {different} of them different"
+            + "".join(f"\n  WRONG: {wrong}" for wrong in last)
+        )
     finally:
         worker.stop()
         server.stop()
@@ -378,8 +403,10 @@ def main() -> int:
             shutil.rmtree(folder, ignore_errors=True)
     for stage in dict.fromkeys(["create", "upload", "queue", "start", *STAGES, *(stage for _, stage in kills)]):
         log(f"  killed in {stage}: worker {kills['worker', stage]}, server {kills['server', stage]}")
-    log(f"{sum(kills.values())} kills in {rounds} surveys, {api.repeated} requests repeated, "
-        f"{time.monotonic() - begun:.0f} s: {len(failures)} wrong")
+    log(
+        f"{sum(kills.values())} kills in {rounds} surveys, {api.repeated} requests repeated, "
+        f"{time.monotonic() - begun:.0f} s: {len(failures)} wrong"
+    )
     return 1 if failures else 0
 
 

@@ -112,7 +112,9 @@ def main() -> int:
         end = time.time() + args.seconds
         mine, theirs = zip(*(multiprocessing.Pipe(duplex=False) for _ in range(2)))
         work = [
-            multiprocessing.Process(target=upload, args=(service.listen, service.key, flight, args.clients, end, theirs[0])),
+            multiprocessing.Process(
+                target=upload, args=(service.listen, service.key, flight, args.clients, end, theirs[0])
+            ),
             multiprocessing.Process(target=look, args=(service.listen, service.key, paths, args.rate, end, theirs[1])),
         ]
         for process in work:

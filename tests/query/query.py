@@ -51,11 +51,23 @@ def feature(rng: random.Random, plant: str, row: int, column: int) -> tuple:
         "id": identifier,
         "geometry": {"type": "Polygon", "coordinates": [[*ring, ring[0]]]},
         "properties": {
-            "id": identifier, "label": label, "plant": plant, "line": groups[0], "bench": groups[1], "sector": groups[2],
-            "row": row % 4 + 1, "number": column % 50 + 1, "center": [west + EAST / 2, south + NORTH / 2, 100.6789],
-            "tilt_deg": 25.0 + rng.random(), "azimuth_deg": 180.0 + rng.random(), "width_m": 0.992 + rng.random() / 1000,
-            "height_m": 1.64 + rng.random() / 1000, "sigma_m": [rng.random() / 50 for _ in range(3)], "views": 4,
-            "images": [f"DJI_{rng.randrange(10000):04}.JPG" for _ in range(4)], "status": "detected",
+            "id": identifier,
+            "label": label,
+            "plant": plant,
+            "line": groups[0],
+            "bench": groups[1],
+            "sector": groups[2],
+            "row": row % 4 + 1,
+            "number": column % 50 + 1,
+            "center": [west + EAST / 2, south + NORTH / 2, 100.6789],
+            "tilt_deg": 25.0 + rng.random(),
+            "azimuth_deg": 180.0 + rng.random(),
+            "width_m": 0.992 + rng.random() / 1000,
+            "height_m": 1.64 + rng.random() / 1000,
+            "sigma_m": [rng.random() / 50 for _ in range(3)],
+            "views": 4,
+            "images": [f"DJI_{rng.randrange(10000):04}.JPG" for _ in range(4)],
+            "status": "detected",
         },
     }
     strip = math.floor((west + 180) / STRIP)
@@ -78,7 +90,9 @@ class Rows:
 
     def psql(self, *arguments: str, feed: io.StringIO | None = None) -> str:
         command = ["psql", "--no-psqlrc", "--set=ON_ERROR_STOP=1", self.database, *arguments]
-        return subprocess.run(command, input=feed.getvalue() if feed else None, check=True, capture_output=True, text=True).stdout
+        return subprocess.run(
+            command, input=feed.getvalue() if feed else None, check=True, capture_output=True, text=True
+        ).stdout
 
     def features(self, model: str, features: Iterator[tuple]) -> None:
         if self.sqlite:
@@ -161,7 +175,7 @@ def main() -> int:
         some = rows.model(large, args.side, args.side, rng)
         rows.model(small, *WHOLE, rng)
         rows.finish()
-        print(f"{name}: {args.side ** 2} modules written in {time.monotonic() - begun:.0f} s", flush=True)
+        print(f"{name}: {args.side**2} modules written in {time.monotonic() - begun:.0f} s", flush=True)
         with service.again():
             counts: list[int] = []
             side = math.isqrt(1000)
@@ -192,7 +206,9 @@ def main() -> int:
         p50, p99 = (times[min(len(times) - 1, int(len(times) * share))] for share in (0.5, 0.99))
         holds = p99 < BOUNDS[what]
         wrong += not holds
-        print(f"{name}: {what}: median {p50:.1f} ms, p99 {p99:.1f} ms, bound {BOUNDS[what]:.0f} ms: {'holds' if holds else 'DOES NOT HOLD'}")
+        print(
+            f"{name}: {what}: median {p50:.1f} ms, p99 {p99:.1f} ms, bound {BOUNDS[what]:.0f} ms: {'holds' if holds else 'DOES NOT HOLD'}"
+        )
     return 1 if wrong else 0
 
 

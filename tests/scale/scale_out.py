@@ -125,7 +125,9 @@ class Program:
 
 def machine_cpu_s() -> float:
     """Processor time of everything on this machine so far, what a host takes from it included."""
-    user, nice, system, _idle, _iowait, irq, softirq, steal, *_ = Path("/proc/stat").read_text().split("\n")[0].split()[1:]
+    user, nice, system, _idle, _iowait, irq, softirq, steal, *_ = (
+        Path("/proc/stat").read_text().split("\n")[0].split()[1:]
+    )
     return sum(map(int, (user, nice, system, irq, softirq, steal))) / TICKS
 
 
@@ -242,17 +244,51 @@ def measure(args: argparse.Namespace) -> int:
     apart = args.inside == "namespaces"
     folder = Path(tempfile.mkdtemp(prefix="heliomap-scale-"))
     store = ["--database", os.environ["HELIOMAP_TEST_POSTGRES"] + "/postgres", "--blobs", "s3://heliomap-tests/scale"]
-    env = {"AWS_ENDPOINT_URL": os.environ["HELIOMAP_TEST_S3"], "AWS_REGION": "eu-central-1",
-           "AWS_ACCESS_KEY_ID": "heliomap", "AWS_SECRET_ACCESS_KEY": "heliomap", "HELIOMAP_LOG": "info"}
-    server = Program("server", [str(args.binary), "serve", "--insecure", "--no-worker", "--listen", "127.0.0.1:0",
-                                "--data-dir", str(folder / "server"), *store], folder, env)
+    env = {
+        "AWS_ENDPOINT_URL": os.environ["HELIOMAP_TEST_S3"],
+        "AWS_REGION": "eu-central-1",
+        "AWS_ACCESS_KEY_ID": "heliomap",
+        "AWS_SECRET_ACCESS_KEY": "heliomap",
+        "HELIOMAP_LOG": "info",
+    }
+    server = Program(
+        "server",
+        [
+            str(args.binary),
+            "serve",
+            "--insecure",
+            "--no-worker",
+            "--listen",
+            "127.0.0.1:0",
+            "--data-dir",
+            str(folder / "server"),
+            *store,
+        ],
+        folder,
+        env,
+    )
     cores = sorted(os.sched_getaffinity(0))
     workers = {}
     for number, name in enumerate(NAMES):
         place = ["ip", "netns", "exec", namespace(name)] if apart else []
-        workers[name] = Program(name, [*place, "taskset", "--cpu-list", str(cores[number % len(cores)]),
-                                       str(args.binary), "worker", "--lease", "3", "--data-dir", str(folder / name), *store],
-                                folder, env)
+        workers[name] = Program(
+            name,
+            [
+                *place,
+                "taskset",
+                "--cpu-list",
+                str(cores[number % len(cores)]),
+                str(args.binary),
+                "worker",
+                "--lease",
+                "3",
+                "--data-dir",
+                str(folder / name),
+                *store,
+            ],
+            folder,
+            env,
+        )
     # The servers; what this script started, the service and the workers, comes of itself.
     own = {os.getpid(), server_on(os.environ["HELIOMAP_TEST_POSTGRES"]), server_on(os.environ["HELIOMAP_TEST_S3"])}
     wrongs: list[str] = []
@@ -264,8 +300,10 @@ def measure(args: argparse.Namespace) -> int:
                 raise SystemExit(server.log.read_text())
             time.sleep(0.05)
         service = Service(found[1] + "/api/v1", args.data)
-        log(f"{args.data}: {len(list((args.data / 'images').iterdir()))} photos; workers "
-            f"{'in network namespaces' if apart else 'on loopback'}, each on one core")
+        log(
+            f"{args.data}: {len(list((args.data / 'images').iterdir()))} photos; workers "
+            f"{'in network namespaces' if apart else 'on loopback'}, each on one core"
+        )
 
         def one_run(names: tuple[str, ...]) -> tuple[float, dict[str, float], float, str]:
             """Seconds, processor seconds by worker, cores that what is not of this test takes, and the model."""
@@ -313,8 +351,10 @@ def measure(args: argparse.Namespace) -> int:
                     wrongs.append(f"a model by {' and '.join(names)} is another one")
                 quiet = foreign <= QUIET
                 shares = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in cpu.items())
-                log(f"by {len(names)}: {took:.1f} s; processor time: {shares}; others took {foreign:.2f} of a core"
-                    + ("" if quiet else ": does not count"))
+                log(
+                    f"by {len(names)}: {took:.1f} s; processor time: {shares}; others took {foreign:.2f} of a core"
+                    + ("" if quiet else ": does not count")
+                )
                 if quiet:
                     (alone if len(names) == 1 else both).append(took)
                     (busiest_alone if len(names) == 1 else busiest).append(max(cpu.values()))
@@ -327,16 +367,20 @@ def measure(args: argparse.Namespace) -> int:
         if not busy:
             share = statistics.median(both) / statistics.median(alone)
             cpu_share = statistics.median(busiest) / statistics.median(busiest_alone)
-            figures = (f"{statistics.median(alone):.1f} s by one, {statistics.median(both):.1f} s by two: {share:.2f} of the time; "
-                       f"of the processor time of the busier one {cpu_share:.2f}")
+            figures = (
+                f"{statistics.median(alone):.1f} s by one, {statistics.median(both):.1f} s by two: {share:.2f} of the time; "
+                f"of the processor time of the busier one {cpu_share:.2f}"
+            )
             if share > args.share:
                 wrongs.append(f"two workers take {share:.2f} of the time of one, more than {args.share}")
 
         for whom in ("helper", "owner"):
             warm(*NAMES)
             wrong = cut(service, workers, whom, apart, expected)
-            log(f"the {whom} {'cut off' if apart else 'killed'} in the middle: "
-                + (wrong or "the survey ended, the model is the same"))
+            log(
+                f"the {whom} {'cut off' if apart else 'killed'} in the middle: "
+                + (wrong or "the survey ended, the model is the same")
+            )
             if wrong:
                 wrongs.append(wrong)
     finally:
@@ -362,8 +406,12 @@ def cut(service: Service, workers: dict[str, Program], whom: str, apart: bool, e
         progress = job.get("progress") or {}
         if done or progress.get("stage") != "detect" or progress.get("done", 0) < 1:
             return
-        owner = next(name for name, worker in workers.items() if worker.said(f"job{{job={job['id']}") or
-                     re.search(rf"{job['id']}.*job started", worker.log.read_text(errors="replace")))
+        owner = next(
+            name
+            for name, worker in workers.items()
+            if worker.said(f"job{{job={job['id']}")
+            or re.search(rf"{job['id']}.*job started", worker.log.read_text(errors="replace"))
+        )
         victim = owner if whom == "owner" else next(name for name in workers if name != owner)
         done["victim"] = victim
         if apart:

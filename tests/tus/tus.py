@@ -80,7 +80,9 @@ class Proxy:
 
 def call(base: str, method: str, path: str, value: dict | None = None) -> dict:
     body = json.dumps(value).encode() if value is not None else None
-    request = urllib.request.Request(base + path, data=body, method=method, headers={"Content-Type": "application/json"})
+    request = urllib.request.Request(
+        base + path, data=body, method=method, headers={"Content-Type": "application/json"}
+    )
     with urllib.request.urlopen(request, timeout=60) as answer:
         return json.loads(answer.read())
 
@@ -120,8 +122,16 @@ def main() -> int:
             probe.bind(("127.0.0.1", 0))
             port = probe.getsockname()[1]
         log = open(Path(folder) / "service.log", "wb")
-        command = [str(args.binary), "serve", "--insecure", "--no-worker", "--listen", f"127.0.0.1:{port}",
-                   "--data-dir", str(Path(folder) / "data")]
+        command = [
+            str(args.binary),
+            "serve",
+            "--insecure",
+            "--no-worker",
+            "--listen",
+            f"127.0.0.1:{port}",
+            "--data-dir",
+            str(Path(folder) / "data"),
+        ]
         base = f"http://127.0.0.1:{port}"
 
         def start() -> subprocess.Popen:
@@ -155,8 +165,11 @@ def main() -> int:
                 files = call(base, "GET", here)["files"]
                 good = [stored["sha256"] for stored in files] == [digest] and proxy.cut == args.cuts
                 wrong += not good
-                print(f"{name}: {size} bytes through {proxy.cut} disconnects and one kill of the service in {seconds:.1f} s, "
-                      f"{proxy.passed - size} bytes sent twice; {'the bytes agree' if good else f'WRONG: {files}'}", flush=True)
+                print(
+                    f"{name}: {size} bytes through {proxy.cut} disconnects and one kill of the service in {seconds:.1f} s, "
+                    f"{proxy.passed - size} bytes sent twice; {'the bytes agree' if good else f'WRONG: {files}'}",
+                    flush=True,
+                )
         finally:
             service[0].terminate()
             service[0].wait(timeout=60)

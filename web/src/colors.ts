@@ -16,12 +16,13 @@ const OTHER = "#8d939b";
 
 /** The colour of a module by the properties that the map was given. */
 export function expression(by: ColorBy): ExpressionSpecification {
-  const cycle = (property: string, colors: string[]): ExpressionSpecification => [
-    "match",
-    ["%", ["get", property], colors.length],
-    ...colors.slice(1).flatMap((color, index) => [index + 1, color]),
-    colors[0],
-  ] as unknown as ExpressionSpecification;
+  const cycle = (property: string, colors: string[]): ExpressionSpecification =>
+    [
+      "match",
+      ["%", ["get", property], colors.length],
+      ...colors.slice(1).flatMap((color, index) => [index + 1, color]),
+      colors[0],
+    ] as unknown as ExpressionSpecification;
   if (by === "bench") return cycle("benchIndex", BENCHES);
   if (by === "row") return cycle("rowIndex", ROWS);
   const statuses = Object.entries(STATUS).flatMap(([status, { color }]) => [status, color]);

@@ -1,8 +1,8 @@
 import {
   type Feature,
+  type GroupProperties,
   getLayer,
   getModel,
-  type GroupProperties,
   listModels,
   listPlants,
   type ModelDetail,
@@ -36,16 +36,26 @@ const shown = {
 let loading = new AbortController();
 
 const map = openMap();
-const surveys = new Surveys(byId("surveys"), (plant, version) => {
-  // Identifiers outlive models: the module that is looked at stays in sight.
-  if (plant === plants.value) void attempt(() => openPlant(plant, version, shown.selected));
-}, (photos) => void map?.showPhotos(photos));
+const surveys = new Surveys(
+  byId("surveys"),
+  (plant, version) => {
+    // Identifiers outlive models: the module that is looked at stays in sight.
+    if (plant === plants.value) void attempt(() => openPlant(plant, version, shown.selected));
+  },
+  (photos) => void map?.showPhotos(photos),
+);
 
 function openMap(): PlantMap | undefined {
   try {
     return new PlantMap(byId("map"), (id) => select(id));
   } catch (error) {
-    byId("map").replaceChildren(h("p", {}, `The map needs WebGL, which this browser does not offer (${error}). Search and details work without it.`));
+    byId("map").replaceChildren(
+      h(
+        "p",
+        {},
+        `The map needs WebGL, which this browser does not offer (${error}). Search and details work without it.`,
+      ),
+    );
     return undefined;
   }
 }
@@ -72,13 +82,25 @@ async function attempt(action: () => Promise<void>): Promise<void> {
 
 /** A form for the key that the service asks for. */
 function askForKey(then: () => void): HTMLFormElement {
-  const key = h("input", { type: "password", "aria-label": "Key", placeholder: "hm_…", autocomplete: "off", required: true });
+  const key = h("input", {
+    type: "password",
+    "aria-label": "Key",
+    placeholder: "hm_…",
+    autocomplete: "off",
+    required: true,
+  });
   const go = (event: Event) => {
     event.preventDefault();
     useKey(key.value.trim());
     then();
   };
-  return h("form", { submit: go }, h("span", {}, "This service asks for a key that may read. "), key, h("button", {}, "Go on"));
+  return h(
+    "form",
+    { submit: go },
+    h("span", {}, "This service asks for a key that may read. "),
+    key,
+    h("button", {}, "Go on"),
+  );
 }
 
 function remember(): void {
@@ -153,7 +175,11 @@ async function openModel(plant: string, version: number, module?: string): Promi
   ]);
   if (signal.aborted) return;
   await present(model, modules, benches, lines);
-  status.textContent = [plural(modules.length, "module"), plural(benches.length, "bench", "benches"), plural(lines.length, "line")].join(", ");
+  status.textContent = [
+    plural(modules.length, "module"),
+    plural(benches.length, "bench", "benches"),
+    plural(lines.length, "line"),
+  ].join(", ");
   if (module) select(module);
 }
 
@@ -217,11 +243,14 @@ function find(): void {
     ({ id, properties }) => properties.label.toLowerCase().includes(text) || id.toLowerCase().startsWith(text),
   );
   const more = hits.length > MAX_RESULTS ? `, the first ${MAX_RESULTS} shown` : "";
-  said.textContent = hits.length > 0 ? `${plural(hits.length, "module")}${more}` : "No module has such a label or identifier.";
+  said.textContent =
+    hits.length > 0 ? `${plural(hits.length, "module")}${more}` : "No module has such a label or identifier.";
   byId("results").replaceChildren(
     ...hits
       .slice(0, MAX_RESULTS)
-      .map(({ id, properties }) => h("li", {}, h("button", { type: "button", class: "plain", click: () => select(id) }, properties.label))),
+      .map(({ id, properties }) =>
+        h("li", {}, h("button", { type: "button", class: "plain", click: () => select(id) }, properties.label)),
+      ),
   );
 }
 
@@ -231,7 +260,13 @@ function select(id: string | undefined): void {
   const place = byId("module");
   place.hidden = !module;
   place.replaceChildren(
-    ...(module ? moduleDetails(module, (group) => shown.nameOfId.get(group), () => select(undefined)) : []),
+    ...(module
+      ? moduleDetails(
+          module,
+          (group) => shown.nameOfId.get(group),
+          () => select(undefined),
+        )
+      : []),
   );
   void map?.select(module);
   remember();

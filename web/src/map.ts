@@ -56,7 +56,12 @@ export class PlantMap {
             type: "line",
             source: "outlines",
             filter: ["==", ["get", "kind"], "line"],
-            paint: { "line-color": "#8a8578", "line-width": 1.5, "line-dasharray": [3, 3], "line-offset": ["interpolate", ["linear"], ["zoom"], 16, -1, 20, -6] },
+            paint: {
+              "line-color": "#8a8578",
+              "line-width": 1.5,
+              "line-dasharray": [3, 3],
+              "line-offset": ["interpolate", ["linear"], ["zoom"], 16, -1, 20, -6],
+            },
           },
           {
             id: "modules",
@@ -114,7 +119,13 @@ export class PlantMap {
             type: "symbol",
             source: "photos",
             minzoom: 17,
-            layout: { "text-field": ["get", "name"], "text-font": FONT, "text-size": 11, "text-anchor": "top", "text-offset": [0, 0.7] },
+            layout: {
+              "text-field": ["get", "name"],
+              "text-font": FONT,
+              "text-size": 11,
+              "text-anchor": "top",
+              "text-offset": [0, 0.7],
+            },
             paint: { "text-color": INK, "text-halo-color": "#ffffff", "text-halo-width": 1.5 },
           },
           {
@@ -161,8 +172,8 @@ export class PlantMap {
     this.map.addControl(new ScaleControl({ maxWidth: 160 }), "bottom-left");
     this.ready = new Promise((resolve) => this.map.once("load", resolve));
     // For tests: whether all is drawn.
-    this.map.on("render", () => (container.dataset["drawn"] = "partly"));
-    this.map.on("idle", () => (container.dataset["drawn"] = "all"));
+    this.map.on("render", () => (container.dataset.drawn = "partly"));
+    this.map.on("idle", () => (container.dataset.drawn = "all"));
     this.map.on("mousemove", (event) => this.hover(this.moduleAt(event.point)));
     this.map.on("mouseout", () => this.hover(undefined));
     this.map.on("click", (event) => pick(this.moduleAt(event.point)));

@@ -10,8 +10,8 @@ import {
   listWarnedPhotos,
   type PhotoPosition,
   Problem,
-  startJob,
   type Survey,
+  startJob,
 } from "./api";
 import { h, moment, plural } from "./dom";
 
@@ -134,20 +134,27 @@ export class Surveys {
 
   private draw(survey: Survey, job: Job | undefined, place: HTMLElement, again: () => void): void {
     const act = (label: string, action: () => Promise<unknown>) =>
-      h("button", {
-        type: "button",
-        click: (event) => {
-          const button = event.currentTarget as HTMLButtonElement;
-          button.disabled = true;
-          action().then(again, (error: unknown) => {
-            button.disabled = false;
-            place.querySelector(".trouble")?.remove();
-            place.append(h("p", { class: "trouble", role: "alert" }, told(error)));
-          });
+      h(
+        "button",
+        {
+          type: "button",
+          click: (event) => {
+            const button = event.currentTarget as HTMLButtonElement;
+            button.disabled = true;
+            action().then(again, (error: unknown) => {
+              button.disabled = false;
+              place.querySelector(".trouble")?.remove();
+              place.append(h("p", { class: "trouble", role: "alert" }, told(error)));
+            });
+          },
         },
-      }, label);
+        label,
+      );
     if (!job) {
-      place.replaceChildren(h("p", { class: "quiet" }, "Not mapped yet."), act("Map it", () => startJob(survey)));
+      place.replaceChildren(
+        h("p", { class: "quiet" }, "Not mapped yet."),
+        act("Map it", () => startJob(survey)),
+      );
       return;
     }
     if (!isFinal(job)) {

@@ -27,11 +27,21 @@ function model(plant, lines, benches, columns) {
     return [...place.map((degrees) => Number(degrees.toFixed(9))), Number((412 + z).toFixed(4))];
   };
   const polygon = (west, east, south, north) => {
-    const corners = [[west, south], [east, south], [east, north], [west, north]];
+    const corners = [
+      [west, south],
+      [east, south],
+      [east, north],
+      [west, north],
+    ];
     const ring = corners.map(([x, y]) => position(x, y, 0.4 * (y - south)));
     return { type: "Polygon", coordinates: [[...ring, ring[0]]] };
   };
-  const feature = (id, geometry, properties) => ({ type: "Feature", id, geometry, properties: { id, plant, ...properties } });
+  const feature = (id, geometry, properties) => ({
+    type: "Feature",
+    id,
+    geometry,
+    properties: { id, plant, ...properties },
+  });
   const layers = { modules: [], benches: [], lines: [] };
   for (let l = 1; l <= lines; l++) {
     const line = uuid(`${plant} line ${l}`);
@@ -91,17 +101,36 @@ export async function serve(port = 0) {
   const layersOf = { [north]: model(north, 4, 3, 20), [south]: model(south, 30, 5, 19) };
   const survey = (plant, name) => ({ id: uuid(`${plant} ${name}`), plant, name, created: now });
   const surveysOf = {
-    [north]: [survey(north, "2026-06-20 noon"), survey(north, "2026-06-21 morning"), survey(north, "2026-06-21 evening")],
+    [north]: [
+      survey(north, "2026-06-20 noon"),
+      survey(north, "2026-06-21 morning"),
+      survey(north, "2026-06-21 evening"),
+    ],
     [south]: [survey(south, "2026-05-02")],
     [bare]: [],
   };
   const warnings = [
-    { code: "unmatched_bench", message: "Bench L02-B03 was seen in one photo only; its place in the line is a guess.", images: ["DJI_0004.jpg"] },
-    { code: "image_left_out", message: "Two photos from 75 m do not resolve modules and were left out of detection.", images: ["DJI_0009.jpg", "DJI_0010.jpg"] },
+    {
+      code: "unmatched_bench",
+      message: "Bench L02-B03 was seen in one photo only; its place in the line is a guess.",
+      images: ["DJI_0004.jpg"],
+    },
+    {
+      code: "image_left_out",
+      message: "Two photos from 75 m do not resolve modules and were left out of detection.",
+      images: ["DJI_0009.jpg", "DJI_0010.jpg"],
+    },
   ];
   const begun = new Map();
   const job = (survey, members) => ({
-    id: uuid(`${survey} job`), survey, warnings: [], attempt: 1, max_attempts: 3, cancel_requested: false, created: now, ...members,
+    id: uuid(`${survey} job`),
+    survey,
+    warnings: [],
+    attempt: 1,
+    max_attempts: 3,
+    cancel_requested: false,
+    created: now,
+    ...members,
   });
   const stages = ["read", "detect", "layout", "locate", "fuse", "refine", "assemble"];
   /** The newest job of a survey: the first one failed, the second made model 2, the third runs from its first look. */
@@ -119,12 +148,19 @@ export async function serve(port = 0) {
     const at = Math.floor((seconds - 1) * 7);
     if (at >= 70) return job(id, { state: "succeeded", model_version: 3, finished: new Date().toISOString() });
     const [stage, done_] = [Math.floor(at / 10), at % 10];
-    return job(id, { state: "running", progress: { stage: stages[stage], stage_number: stage + 1, stage_count: 7, done: done_, total: 10 } });
+    return job(id, {
+      state: "running",
+      progress: { stage: stages[stage], stage_number: stage + 1, stage_count: 7, done: done_, total: 10 },
+    });
   };
-  const problem = (status, code, title, detail) => [status, { type: `urn:heliomap:problem:${code}`, title, status, code, detail }];
+  const problem = (status, code, title, detail) => [
+    status,
+    { type: `urn:heliomap:problem:${code}`, title, status, code, detail },
+  ];
   const versionsOf = (id) => {
     if (!layersOf[id]) return [];
-    const newest = id === south ? 1 : [...begun.keys()].some((survey) => jobOf(id, survey).state === "succeeded") ? 3 : 2;
+    const newest =
+      id === south ? 1 : [...begun.keys()].some((survey) => jobOf(id, survey).state === "succeeded") ? 3 : 2;
     return Array.from({ length: newest }, (_, index) => newest - index);
   };
 
@@ -144,19 +180,32 @@ export async function serve(port = 0) {
       files.push({ path: "reconstruction.json", kind: "reconstruction", size: 1_400_000 });
       return [200, { ...surveysOf[id].find((survey) => survey.id === which), complete: true, missing: [], files }];
     }
-    const view = (version) => ({ plant: id, version, survey: "s", job: "j", warnings: id === north ? warnings : [], created: now });
+    const view = (version) => ({
+      plant: id,
+      version,
+      survey: "s",
+      job: "j",
+      warnings: id === north ? warnings : [],
+      created: now,
+    });
     if (what === "models" && !which) return [200, { items: versionsOf(id).map(view) }];
     if (what === "models" && !layer) {
       const layers = Object.entries(layersOf[id]).map(([layer, features]) => ({
-        layer, features: features.length, href: `/api/v1/plants/${id}/models/${which}/${layer}`,
+        layer,
+        features: features.length,
+        href: `/api/v1/plants/${id}/models/${which}/${layer}`,
       }));
       return [200, { ...view(Number(which)), layers }];
     }
     if (what === "models") {
       const features = layersOf[id][layer];
-      const [limit, cursor] = [Number(url.searchParams.get("limit")) || 1e9, Number(url.searchParams.get("cursor")) || 0];
+      const [limit, cursor] = [
+        Number(url.searchParams.get("limit")) || 1e9,
+        Number(url.searchParams.get("cursor")) || 0,
+      ];
       const end = cursor + limit;
-      const links = end < features.length ? [{ rel: "next", href: `${url.pathname}?limit=${limit}&cursor=${end}` }] : undefined;
+      const links =
+        end < features.length ? [{ rel: "next", href: `${url.pathname}?limit=${limit}&cursor=${end}` }] : undefined;
       return [200, { type: "FeatureCollection", links, features: features.slice(cursor, end) }];
     }
     return problem(404, "not_found", "There is nothing here", "See /openapi.yaml.");

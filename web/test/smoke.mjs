@@ -86,13 +86,20 @@ try {
     await page.locator(".survey").filter({ hasText: "is cut short" }).waitFor();
     const failed = page.locator(".survey").filter({ hasText: "2026-06-20 noon" });
     await failed.getByRole("button", { name: "Map it again" }).click();
-    await failed.locator(".stage").filter({ hasText: /Step [2-6] of 7/ }).waitFor();
+    await failed
+      .locator(".stage")
+      .filter({ hasText: /Step [2-6] of 7/ })
+      .waitFor();
     assert.ok((await failed.locator("progress").evaluate((bar) => bar.position)) > 0.1);
     await failed.scrollIntoViewIfNeeded();
     await shot("progress");
     await failed.filter({ hasText: "Mapped as model 3" }).waitFor();
     // Its end opens the new model.
-    await page.locator("#models").locator("option:checked").filter({ hasText: /^3, / }).waitFor({ state: "attached", timeout: 30_000 });
+    await page
+      .locator("#models")
+      .locator("option:checked")
+      .filter({ hasText: /^3, / })
+      .waitFor({ state: "attached", timeout: 30_000 });
 
     await page.locator("#plants").selectOption({ label: "Sunfield South" });
     await status.filter({ hasText: "150 benches, 30 lines" }).waitFor();

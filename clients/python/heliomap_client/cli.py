@@ -24,8 +24,12 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="heliomap-client", description="Map a photovoltaic plant with a heliomap service.")
-    parser.add_argument("--url", default=os.environ.get("HELIOMAP_URL", "http://127.0.0.1:8080"), help="the service (HELIOMAP_URL)")
+    parser = argparse.ArgumentParser(
+        prog="heliomap-client", description="Map a photovoltaic plant with a heliomap service."
+    )
+    parser.add_argument(
+        "--url", default=os.environ.get("HELIOMAP_URL", "http://127.0.0.1:8080"), help="the service (HELIOMAP_URL)"
+    )
     parser.add_argument("--key", default=os.environ.get("HELIOMAP_KEY"), help="a key of it (better: HELIOMAP_KEY)")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
@@ -73,7 +77,9 @@ def _upload(client: Client, args: argparse.Namespace) -> int:
     report = client.upload_folder(plant, survey, args.folder, parallel=args.parallel, on_file=_tell_file)
     for path, problem in report.refused.items():
         print(f"{path}: refused, {problem}", file=sys.stderr)
-    print(f"{len(report.stored)} stored, {report.skipped} were there, {len(report.refused)} refused, {len(report.warned)} with warnings")
+    print(
+        f"{len(report.stored)} stored, {report.skipped} were there, {len(report.refused)} refused, {len(report.warned)} with warnings"
+    )
     for missing in client.survey(plant, survey)["missing"]:
         print(f"missing: {missing['message']}")
     return 1 if report.refused else 0
@@ -97,7 +103,11 @@ def _follow(client: Client, args: argparse.Namespace) -> int:
 
 def _tell_job(job: Json) -> None:
     progress = job.get("progress")
-    where = f", {progress['stage']} {progress['done']} of {progress['total']}" if progress and job["state"] == "running" else ""
+    where = (
+        f", {progress['stage']} {progress['done']} of {progress['total']}"
+        if progress and job["state"] == "running"
+        else ""
+    )
     why = f": {job['error']['message']}" if job["state"] == "failed" and job.get("error") else ""
     print(f"{job['state']}{where}{why}", flush=True)
 

@@ -118,7 +118,9 @@ class Client:
                     wait = answer.headers.get("Retry-After", "")
                     problem = Problem(answer.code, _document(answer), float(wait) if wait.isdigit() else None)
                 # What a later try may mend: busy, overloaded, standing still, interrupted, failing.
-                if attempt == tries or not (answer.code in (408, 423, 429) or answer.code >= 500 or problem.code == "upload_interrupted"):
+                if attempt == tries or not (
+                    answer.code in (408, 423, 429) or answer.code >= 500 or problem.code == "upload_interrupted"
+                ):
                     raise problem from None
                 pause = pause_s(attempt) if problem.retry_after_s is None else problem.retry_after_s
             except (OSError, http.client.HTTPException) as error:

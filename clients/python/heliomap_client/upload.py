@@ -67,7 +67,9 @@ def upload_folder(
     """As `Client.upload_folder`."""
     files = list(survey_files(folder))
     if not files:
-        raise ValueError(f"{folder} holds no file of a survey: expected are images/ and reconstruction.json, as OpenSfM has them")
+        raise ValueError(
+            f"{folder} holds no file of a survey: expected are images/ and reconstruction.json, as OpenSfM has them"
+        )
     here = survey_path(plant, survey)
     known = {file["path"]: file["sha256"] for file in client.survey(plant, survey)["files"]}
     pending = _Pending(folder / STATE_FILE)
@@ -87,7 +89,11 @@ def upload_folder(
                 stored = _put(client, here, place, path, digest)
         except Problem as problem:
             # A key that does not fit, or a survey that is gone, is the same for every file.
-            if problem.status in (401, 403) or problem.code in ("plant_not_found", "survey_not_found") or problem.status >= 500:
+            if (
+                problem.status in (401, 403)
+                or problem.code in ("plant_not_found", "survey_not_found")
+                or problem.status >= 500
+            ):
                 raise
             with lock:
                 report.refused[place] = problem
@@ -191,7 +197,9 @@ def _resumed(client: Client, here: str, place: str, path: Path, digest: bytes, p
                 client.open("PATCH", url, headers=headers, body=lambda: file, tries=1).close()
             offset = size
         except (Unreachable, Problem) as error:
-            if isinstance(error, Problem) and not (error.status in (408, 409, 423, 429) or error.status >= 500 or error.code == "upload_interrupted"):
+            if isinstance(error, Problem) and not (
+                error.status in (408, 409, 423, 429) or error.status >= 500 or error.code == "upload_interrupted"
+            ):
                 pending.set(here, place, digest, None)
                 raise
             # What came counts: the service says how much that is.
