@@ -15,59 +15,32 @@ use std::sync::{Condvar, Mutex, PoisonError};
 /// The largest model file that is read.
 pub const MAX_MODEL_BYTES: u64 = 512 << 20;
 
-/// What runs the models: ONNX Runtime's own CPU kernels, or one of the accelerators that a build of it may offer.
+/// What runs the models: ONNX Runtime's own CPU kernels, or CUDA where the library was built with it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum ExecutionProvider {
     #[default]
     Cpu,
     Cuda,
-    Tensorrt,
-    Migraphx,
-    Openvino,
-    Xnnpack,
-    Coreml,
-    Directml,
 }
 
 impl ExecutionProvider {
     /// All of them.
-    const ALL: [Self; 8] = [
-        Self::Cpu,
-        Self::Cuda,
-        Self::Tensorrt,
-        Self::Migraphx,
-        Self::Openvino,
-        Self::Xnnpack,
-        Self::Coreml,
-        Self::Directml,
-    ];
+    const ALL: [Self; 2] = [Self::Cpu, Self::Cuda];
 
     /// The name as people write it.
     pub fn as_str(self) -> &'static str {
         match self {
             Self::Cpu => "CPU",
             Self::Cuda => "CUDA",
-            Self::Tensorrt => "TensorRT",
-            Self::Migraphx => "MIGraphX",
-            Self::Openvino => "OpenVINO",
-            Self::Xnnpack => "XNNPACK",
-            Self::Coreml => "CoreML",
-            Self::Directml => "DirectML",
         }
     }
 
     /// What is registered before a session opens; nothing for the CPU, which ONNX Runtime always has.
     fn dispatch(self) -> Option<ep::ExecutionProviderDispatch> {
-        Some(match self {
-            Self::Cpu => return None,
-            Self::Cuda => ep::CUDA::default().build(),
-            Self::Tensorrt => ep::TensorRT::default().build(),
-            Self::Migraphx => ep::MIGraphX::default().build(),
-            Self::Openvino => ep::OpenVINO::default().build(),
-            Self::Xnnpack => ep::XNNPACK::default().build(),
-            Self::Coreml => ep::CoreML::default().build(),
-            Self::Directml => ep::DirectML::default().build(),
-        })
+        match self {
+            Self::Cpu => None,
+            Self::Cuda => Some(ep::CUDA::default().build()),
+        }
     }
 }
 
