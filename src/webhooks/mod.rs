@@ -6,7 +6,7 @@ pub mod signature;
 pub mod target;
 
 pub use sender::{Sender, SenderSettings};
-pub use signature::{HEADER, sign, verify};
+pub use signature::{HEADER, sign};
 pub use target::{TargetError, Targets};
 
 use crate::store::{DeliveryClaim, DeliveryId, JobId, SurveyId};
