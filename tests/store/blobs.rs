@@ -26,9 +26,10 @@ macro_rules! on_both {
         mod bucket {
             $(
                 #[tokio::test]
+                #[ignore = "needs an S3-compatible server; run `make unit`"]
                 async fn $name() {
                     let data = tempfile::tempdir().unwrap();
-                    let Some(blobs) = super::in_bucket(data.path()) else { return };
+                    let blobs = super::in_bucket(data.path());
                     super::$name(&blobs, data.path()).await;
                 }
             )*
@@ -47,22 +48,20 @@ on_both!(
 );
 
 /// Blobs in a part of their own of the test server's bucket.
-fn in_bucket(data: &Path) -> Option<Blobs> {
-    beside_each_other(&[data])?.pop()
+fn in_bucket(data: &Path) -> Blobs {
+    beside_each_other(&[data]).remove(0)
 }
 
 /// Blobs in one part of that bucket for servers with data folders of their own.
-fn beside_each_other(data: &[&Path]) -> Option<Vec<Blobs>> {
-    let Ok(endpoint) = std::env::var("HELIOMAP_TEST_S3") else {
-        println!("skipped: no S3-compatible server; `make unit` starts one, and so does tests/with-s3.sh");
-        return None;
-    };
+fn beside_each_other(data: &[&Path]) -> Vec<Blobs> {
+    let endpoint = std::env::var("HELIOMAP_TEST_S3")
+        .expect("HELIOMAP_TEST_S3 must name a server: run `make unit`, or tests/with-s3.sh before cargo test");
     let bucket: Bucket = format!("s3://heliomap-tests/{}", Uuid::new_v4()).parse().unwrap();
     let settings = AmazonS3Builder::new()
         .with_endpoint(endpoint)
         .with_access_key_id("heliomap")
         .with_secret_access_key("heliomap-secret");
-    Some(data.iter().map(|data| Blobs::in_bucket(data, &bucket, settings.clone()).unwrap()).collect())
+    data.iter().map(|data| Blobs::in_bucket(data, &bucket, settings.clone()).unwrap()).collect()
 }
 
 fn plant(number: u128) -> PlantId {
@@ -206,9 +205,10 @@ async fn a_damaged_blob_is_not_handed_out_and_is_whole_once_its_bytes_come_again
 }
 
 #[tokio::test]
+#[ignore = "needs an S3-compatible server; run `make unit`"]
 async fn an_upload_goes_on_at_another_server() {
     let [here, there] = [(); 2].map(|()| tempfile::tempdir().unwrap());
-    let Some(servers) = beside_each_other(&[here.path(), there.path()]) else { return };
+    let servers = beside_each_other(&[here.path(), there.path()]);
     let [here, there] = &servers[..] else { panic!("there are two") };
     assert!(here.home().is_some() && here.home() != there.home());
     let id = UploadId(Uuid::from_u128(1));

@@ -22,6 +22,7 @@ macro_rules! on_both {
         mod postgres {
             $(
                 #[tokio::test]
+                #[ignore = "needs Postgres; run `make unit`"]
                 async fn $name() {
                     super::conformance::$name(&super::postgres_store().await).await;
                 }
@@ -38,7 +39,7 @@ async fn postgres_store() -> PostgresStore {
 /// The URL of a new database of that server.
 async fn postgres_database() -> String {
     let server = std::env::var("HELIOMAP_TEST_POSTGRES")
-        .expect("tests need a Postgres server: run `make unit`, or tests/with-postgres.sh before cargo test");
+        .expect("HELIOMAP_TEST_POSTGRES must name a server: run `make unit`, or tests/with-postgres.sh before cargo test");
     let name = format!("test_{}", uuid::Uuid::new_v4().simple());
     let pool = sqlx::PgPool::connect(&format!("{server}/postgres")).await.unwrap();
     sqlx::query(sqlx::AssertSqlSafe(format!("CREATE DATABASE {name}"))).execute(&pool).await.unwrap();
@@ -93,6 +94,7 @@ on_both!(
 
 /// Workers of other processes need not wait until they look.
 #[tokio::test]
+#[ignore = "needs Postgres; run `make unit`"]
 async fn postgres_rings_for_work() {
     conformance::work_is_told(&postgres_store().await).await;
 }
@@ -103,6 +105,7 @@ macro_rules! on_postgres {
         mod contention {
             $(
                 #[tokio::test]
+                #[ignore = "needs Postgres; run `make unit`"]
                 async fn $name() {
                     let database = super::postgres_database().await;
                     let store = super::PostgresStore::open(&database).await.unwrap();
