@@ -50,6 +50,7 @@ lint: .venv/lint/done web/node_modules/done ## Formatting and lints of Rust, Pyt
 	.venv/lint/bin/ruff format --check --quiet
 	cd web && npx --no-install biome ci --colors=off --error-on-warnings
 	$(PYTHON) .ci/dependencies.py
+	$(PYTHON) .ci/links.py
 	$(CARGO) clippy --locked --workspace --all-targets -- --deny warnings
 
 format: .venv/lint/done web/node_modules/done ## Format Rust, Python and TypeScript, and apply the linters' safe fixes
