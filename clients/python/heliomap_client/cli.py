@@ -7,7 +7,8 @@ import os
 import sys
 from pathlib import Path
 
-from .client import Client, HeliomapError, Json
+from .client import Client
+from .connection import HeliomapError, Json
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -19,7 +20,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"heliomap-client: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print("heliomap-client: broken off; give the same command again to go on", file=sys.stderr)
+        print("heliomap-client: interrupted; run the same command again to continue", file=sys.stderr)
         return 130
 
 
@@ -30,7 +31,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--url", default=os.environ.get("HELIOMAP_URL", "http://127.0.0.1:8080"), help="the service (HELIOMAP_URL)"
     )
-    parser.add_argument("--key", default=os.environ.get("HELIOMAP_KEY"), help="a key of it (better: HELIOMAP_KEY)")
+    parser.add_argument(
+        "--key", default=os.environ.get("HELIOMAP_KEY"), help="a key of the service (better: HELIOMAP_KEY)"
+    )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     def command(name: str, what: str, run: object, *names: str) -> argparse.ArgumentParser:
@@ -39,7 +42,7 @@ def _parser() -> argparse.ArgumentParser:
         if "folder" in names:
             one.add_argument("folder", type=Path, help="a folder as OpenSfM leaves it")
             one.add_argument("--parallel", type=int, default=4, help="files at once")
-        made = "; made where there is none" if "folder" in names else ""
+        made = "; created if missing" if "folder" in names else ""
         one.add_argument("--plant", required=True, help=f"the plant's name{made}")
         if "survey" in names:
             one.add_argument("--survey", required=True, help=f"the survey's name{made}")
@@ -57,7 +60,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _plant(client: Client, args: argparse.Namespace, make: bool = False) -> str:
-    """The plant of that name. A key for that plant alone finds it, too; only a key for all makes one."""
+    """The plant of that name. A key for some plants can find it; only a key for all plants can create it."""
     found = client.find_plant(args.plant) or (client.create_plant(args.plant) if make else None)
     if found is None:
         raise HeliomapError(f"this key sees no plant of the name `{args.plant}`")
@@ -74,18 +77,18 @@ def _survey(client: Client, args: argparse.Namespace, make: bool = False) -> tup
 
 def _upload(client: Client, args: argparse.Namespace) -> int:
     plant, survey = _survey(client, args, make=True)
-    report = client.upload_folder(plant, survey, args.folder, parallel=args.parallel, on_file=_tell_file)
+    report = client.upload_folder(plant, survey, args.folder, parallel=args.parallel, on_file=_print_file)
     for path, problem in report.refused.items():
         print(f"{path}: refused, {problem}", file=sys.stderr)
     print(
-        f"{len(report.stored)} stored, {report.skipped} were there, {len(report.refused)} refused, {len(report.warned)} with warnings"
+        f"{len(report.stored)} stored, {report.skipped} unchanged, {len(report.refused)} refused, {len(report.warned)} with warnings"
     )
     for missing in client.survey(plant, survey)["missing"]:
         print(f"missing: {missing['message']}")
     return 1 if report.refused else 0
 
 
-def _tell_file(file: Json) -> None:
+def _print_file(file: Json) -> None:
     warnings = "; ".join(warning["message"] for warning in file.get("warnings", []))
     print(f"{file['path']}: {file['result']}{f' ({warnings})' if warnings else ''}", flush=True)
 
@@ -97,11 +100,11 @@ def _start(client: Client, args: argparse.Namespace) -> int:
 
 
 def _follow(client: Client, args: argparse.Namespace) -> int:
-    job = client.follow(_plant(client, args), args.job, _tell_job)
+    job = client.follow(_plant(client, args), args.job, _print_job)
     return 0 if job["state"] == "succeeded" else 1
 
 
-def _tell_job(job: Json) -> None:
+def _print_job(job: Json) -> None:
     progress = job.get("progress")
     where = (
         f", {progress['stage']} {progress['done']} of {progress['total']}"
@@ -120,11 +123,11 @@ def _fetch(client: Client, args: argparse.Namespace) -> int:
 
 def _map(client: Client, args: argparse.Namespace) -> int:
     plant, survey = _survey(client, args, make=True)
-    # A key that may not read hears so before the work and not after it.
+    # A key without the scope `read` fails before the work, not after it.
     client.call("GET", f"/api/v1/plants/{plant}/models?limit=1")
     if _upload(client, args):
         return 1
-    job = client.follow(plant, client.start_job(plant, survey)["id"], _tell_job)
+    job = client.follow(plant, client.start_job(plant, survey)["id"], _print_job)
     if job["state"] != "succeeded":
         return 1
     client.fetch_layer(plant, args.out, args.layer, job["model_version"])

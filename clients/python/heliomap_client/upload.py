@@ -1,4 +1,4 @@
-"""From a folder to a survey: in parallel, resuming, nothing sent twice that is there."""
+"""Uploads a folder to a survey: in parallel, resumable, without files that the survey has already."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import quote
 
-from .client import Client, Json, Problem, Unreachable, pause_s, survey_path
+from .connection import Connection, Json, Problem, Unreachable, pause_s, survey_path
 
 RECONSTRUCTION = (
     "boxes.json",
@@ -34,14 +34,14 @@ TUS = {"Tus-Resumable": "1.0.0"}
 
 @dataclass
 class UploadReport:
-    """What became of a folder's files."""
+    """The outcome of an upload of a folder."""
 
     stored: list[Json] = field(default_factory=list)
-    """As the service answers them."""
+    """The service's answers."""
     skipped: int = 0
-    """Files that were there with the same bytes."""
+    """Files that the survey had with the same bytes."""
     refused: dict[str, Problem] = field(default_factory=dict)
-    """By path: files that the service will not take, and why."""
+    """By path: files that the service refused, and why."""
 
     @property
     def warned(self) -> list[Json]:
@@ -62,7 +62,7 @@ def survey_files(folder: Path) -> Iterator[tuple[str, Path]]:
 
 
 def upload_folder(
-    client: Client, plant: str, survey: str, folder: Path, parallel: int, on_file: Callable[[Json], None]
+    connection: Connection, plant: str, survey: str, folder: Path, parallel: int, on_file: Callable[[Json], None]
 ) -> UploadReport:
     """As `Client.upload_folder`."""
     files = list(survey_files(folder))
@@ -71,7 +71,7 @@ def upload_folder(
             f"{folder} holds no file of a survey: expected are images/ and reconstruction.json, as OpenSfM has them"
         )
     here = survey_path(plant, survey)
-    known = {file["path"]: file["sha256"] for file in client.survey(plant, survey)["files"]}
+    known = {file["path"]: file["sha256"] for file in connection.call("GET", here)["files"]}
     pending = _Pending(folder / STATE_FILE)
     report = UploadReport()
     lock = threading.Lock()
@@ -84,9 +84,9 @@ def upload_folder(
             return
         try:
             if path.stat().st_size > RESUMED_BYTES:
-                stored = _resumed(client, here, place, path, digest, pending)
+                stored = _resumed(connection, here, place, path, digest, pending)
             else:
-                stored = _put(client, here, place, path, digest)
+                stored = _put(connection, here, place, path, digest)
         except Problem as problem:
             # A key that does not fit, or a survey that is gone, is the same for every file.
             if (
@@ -121,14 +121,14 @@ def _sha256(path: Path) -> bytes:
     return digest.digest()
 
 
-def _put(client: Client, here: str, place: str, path: Path, digest: bytes) -> Json:
+def _put(connection: Connection, here: str, place: str, path: Path, digest: bytes) -> Json:
     where = f"images/{quote(place[7:], safe='')}" if place.startswith("images/") else f"reconstruction/{quote(place)}"
     content = path.read_bytes()
     headers = {
         "Content-Type": "application/octet-stream",
         "Repr-Digest": f"sha-256=:{base64.b64encode(digest).decode()}:",
     }
-    with client.open("PUT", f"{here}/{where}", headers=headers, body=lambda: content) as answer:
+    with connection.open("PUT", f"{here}/{where}", headers=headers, body=lambda: content) as answer:
         return json.loads(answer.read())
 
 
@@ -163,13 +163,13 @@ class _Pending:
                 self._file.unlink(missing_ok=True)
 
 
-def _resumed(client: Client, here: str, place: str, path: Path, digest: bytes, pending: _Pending) -> Json:
+def _resumed(connection: Connection, here: str, place: str, path: Path, digest: bytes, pending: _Pending) -> Json:
     size = path.stat().st_size
     url = pending.get(here, place, digest)
     offset = None
     if url:
         try:
-            with client.open("HEAD", url, headers=TUS) as answer:
+            with connection.open("HEAD", url, headers=TUS) as answer:
                 offset = int(answer.headers["Upload-Offset"])
         except Problem as problem:
             # It was forgotten, or ended: a new one is begun.
@@ -178,7 +178,7 @@ def _resumed(client: Client, here: str, place: str, path: Path, digest: bytes, p
     if url is None or offset is None:
         metadata = f"path {base64.b64encode(place.encode()).decode()}"
         headers = {**TUS, "Upload-Length": str(size), "Upload-Metadata": metadata}
-        with client.open("POST", f"{here}/uploads", headers=headers, body=lambda: b"") as answer:
+        with connection.open("POST", f"{here}/uploads", headers=headers, body=lambda: b"") as answer:
             url = answer.headers["Location"]
         pending.set(here, place, digest, url)
         offset = 0
@@ -194,7 +194,7 @@ def _resumed(client: Client, here: str, place: str, path: Path, digest: bytes, p
                     "Content-Type": "application/offset+octet-stream",
                     "Content-Length": str(size - offset),
                 }
-                client.open("PATCH", url, headers=headers, body=lambda: file, tries=1).close()
+                connection.open("PATCH", url, headers=headers, body=lambda: file, tries=1).close()
             offset = size
         except (Unreachable, Problem) as error:
             if isinstance(error, Problem) and not (
@@ -203,14 +203,14 @@ def _resumed(client: Client, here: str, place: str, path: Path, digest: bytes, p
                 pending.set(here, place, digest, None)
                 raise
             # What came counts: the service says how much that is.
-            with client.open("HEAD", url, headers=TUS) as answer:
+            with connection.open("HEAD", url, headers=TUS) as answer:
                 offset = int(answer.headers["Upload-Offset"])
             stalled = stalled + 1 if offset == before else 0
             if stalled >= 8:
                 raise
             asked_s = error.retry_after_s if isinstance(error, Problem) else None
             time.sleep(pause_s(stalled) if asked_s is None else asked_s)
-    outcome = client.call("GET", url).get("outcome", {})
+    outcome = connection.call("GET", url).get("outcome", {})
     pending.set(here, place, digest, None)
     if outcome.get("problem"):
         raise Problem(outcome["problem"].get("status", 422), outcome["problem"])
