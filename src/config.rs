@@ -5,10 +5,14 @@ pub mod file;
 mod access;
 mod identity;
 mod limits;
+mod mapping;
+mod units;
 
 pub use access::{KeysArgs, KeysCommand, OrganisationsArgs, OrganisationsCommand, Quota};
 pub use identity::OidcArgs;
 pub use limits::Limits;
+pub use mapping::StartJob;
+use units::{parse_days, parse_megapixels, parse_seconds};
 
 use crate::store::Bucket;
 use crate::webhooks::Targets;
@@ -25,10 +29,10 @@ pub struct LogArgs {
     /// Which events are logged: error, warn, info, debug, trace, or directives such as `heliomap=debug,warn`.
     #[arg(long, env = "HELIOMAP_LOG", default_value = "info", global = true, value_name = "FILTER")]
     pub log: String,
-    /// How they are written.
+    /// How events are written.
     #[arg(long, env = "HELIOMAP_LOG_FORMAT", value_enum, default_value = "pretty", global = true)]
     pub log_format: LogFormat,
-    /// A YAML file of settings, `flag: value` in each line; flags and environment go before it.
+    /// A YAML file of settings, `flag: value` in each line. Flags and environment variables take precedence.
     #[arg(long, env = file::VARIABLE, global = true, value_name = "FILE")]
     pub config: Option<PathBuf>,
 }
@@ -36,9 +40,9 @@ pub struct LogArgs {
 /// Where traces are sent.
 #[derive(Debug, Clone, Default, Args)]
 pub struct TraceArgs {
-    /// An OpenTelemetry collector to send traces of requests and jobs to, by OTLP over HTTP, `http://127.0.0.1:4318`. Where it
-    /// is not given, the variables OTEL_EXPORTER_OTLP_ENDPOINT and OTEL_EXPORTER_OTLP_TRACES_ENDPOINT count; headers, sampling
-    /// and batches are set by the other OTEL_ variables.
+    /// An OpenTelemetry collector that receives traces of requests and jobs by OTLP over HTTP, `http://127.0.0.1:4318`. If
+    /// absent, OTEL_EXPORTER_OTLP_TRACES_ENDPOINT and OTEL_EXPORTER_OTLP_ENDPOINT are used. The other OTEL_ variables set
+    /// headers, sampling and batches.
     #[arg(long, env = "HELIOMAP_OTLP_ENDPOINT", global = true, value_name = "URL")]
     pub otlp_endpoint: Option<String>,
 }
@@ -61,7 +65,7 @@ pub struct ServeArgs {
     /// Run no jobs in this process; leave them to `heliomap worker`.
     #[arg(long, env = "HELIOMAP_NO_WORKER")]
     pub no_worker: bool,
-    /// Ask for no keys: whoever reaches the service may do everything. Only on a loopback address.
+    /// Require no keys: everyone who can connect may do everything. Only on a loopback address.
     #[arg(long, env = "HELIOMAP_INSECURE")]
     pub insecure: bool,
     #[command(flatten)]
@@ -89,20 +93,19 @@ pub struct ServeArgs {
 /// What stands between the service and its clients.
 #[derive(Debug, Clone, Default, Args)]
 pub struct NetworkArgs {
-    /// Origin of web pages elsewhere whose scripts may use the service, `https://dashboard.example.org`; may be given more
-    /// than once.
+    /// Origin of other web pages whose scripts may use the service, `https://dashboard.example.org`; may be repeated.
     #[arg(long, env = "HELIOMAP_CORS_ORIGIN", value_delimiter = ',', value_parser = parse_origin, value_name = "ORIGIN")]
     pub cors_origin: Vec<HeaderValue>,
-    /// A proxy stands in front: clients' addresses are what it appends to `x-forwarded-for`.
+    /// The service is behind a proxy: take clients' addresses from what it appends to `x-forwarded-for`.
     #[arg(long, env = "HELIOMAP_BEHIND_PROXY")]
     pub behind_proxy: bool,
 }
 
-/// Who is told of the ends of jobs.
+/// Where messages about finished jobs may go.
 #[derive(Debug, Clone, Default, Args)]
 pub struct WebhookArgs {
-    /// Let webhooks lead to this machine and to private networks, and be told without TLS. Whoever may make webhooks can then
-    /// have this service send requests to whatever it can reach.
+    /// Allow webhooks to this machine, to private networks, and without TLS. Administrators of organisations can then make
+    /// this service send requests to every address that it can reach.
     #[arg(long, env = "HELIOMAP_WEBHOOK_PRIVATE_TARGETS")]
     pub webhook_private_targets: bool,
 }
@@ -114,11 +117,11 @@ impl WebhookArgs {
     }
 }
 
-/// Where the process tells what it counts.
+/// Where the process serves its metrics.
 #[derive(Debug, Clone, Default, Args)]
 pub struct MetricsArgs {
-    /// Address and port of a listener of its own that answers `GET /metrics` in Prometheus' form, and `GET /health`, to
-    /// whoever asks.
+    /// Address and port of a separate listener that serves `GET /metrics` in Prometheus' format and `GET /health`, without
+    /// keys.
     #[arg(long, env = "HELIOMAP_METRICS_LISTEN", value_name = "ADDRESS")]
     pub metrics_listen: Option<SocketAddr>,
 }
@@ -142,31 +145,30 @@ pub struct WorkerArgs {
     pub stop: StopArgs,
 }
 
-/// How long what nothing needs any more is kept.
+/// How long old data is kept.
 #[derive(Debug, Clone, Args)]
 pub struct RetentionArgs {
-    /// Seconds for which the bytes of a file that was replaced are kept where nothing else needs them. No backup may take
-    /// longer.
-    #[arg(long, env = "HELIOMAP_KEEP_REPLACED", default_value = "86400", value_parser = parse_seconds, value_name = "SECONDS")]
+    /// How long the bytes of a replaced file are kept if nothing else needs them. No backup may take longer.
+    #[arg(long, env = "HELIOMAP_KEEP_REPLACED", default_value = "24h", value_parser = parse_seconds, value_name = "DURATION")]
     pub keep_replaced: Duration,
-    /// Days for which the audit log is kept.
-    #[arg(long, env = "HELIOMAP_KEEP_AUDIT", default_value = "400", value_name = "DAYS", value_parser = clap::value_parser!(u32).range(1..=36_500))]
-    pub keep_audit: u32,
+    /// How long the audit log is kept.
+    #[arg(long, env = "HELIOMAP_KEEP_AUDIT", default_value = "400d", value_parser = parse_days, value_name = "DURATION")]
+    pub keep_audit: Duration,
 }
 
 /// How jobs are run.
 #[derive(Debug, Clone, Args)]
 pub struct JobArgs {
-    /// Seconds after which a job whose worker fell silent is taken up by another.
-    #[arg(long, env = "HELIOMAP_LEASE", default_value = "30", value_parser = parse_seconds, value_name = "SECONDS")]
+    /// Time without a heartbeat after which another worker takes over a job.
+    #[arg(long, env = "HELIOMAP_LEASE", default_value = "30s", value_parser = parse_seconds, value_name = "DURATION")]
     pub lease: Duration,
 }
 
 /// How a service ends.
 #[derive(Debug, Clone, Args)]
 pub struct StopArgs {
-    /// Seconds that requests in progress have to end once the process is told to stop; jobs go back to the queue at once.
-    #[arg(long, env = "HELIOMAP_GRACE", default_value = "20", value_parser = parse_seconds, value_name = "SECONDS")]
+    /// Time for requests in progress to finish after a signal to stop; jobs go back to the queue at once.
+    #[arg(long, env = "HELIOMAP_GRACE", default_value = "20s", value_parser = parse_seconds, value_name = "DURATION")]
     pub grace: Duration,
 }
 
@@ -184,7 +186,7 @@ pub struct DoctorArgs {
 /// `heliomap backup`.
 #[derive(Debug, Clone, Args)]
 pub struct BackupArgs {
-    /// Folder for the backup, new or empty; rows and blobs lie in it as in a data folder.
+    /// Folder for the backup, new or empty; its layout is that of a data folder.
     #[arg(value_name = "FOLDER")]
     pub folder: PathBuf,
     #[command(flatten)]
@@ -204,7 +206,7 @@ pub struct RestoreArgs {
 /// `heliomap verify`.
 #[derive(Debug, Clone, Args)]
 pub struct VerifyArgs {
-    /// Read every file and compare its digest, which takes its time.
+    /// Read every file and compare its digest, which takes longer.
     #[arg(long)]
     pub content: bool,
     #[command(flatten)]
@@ -219,23 +221,23 @@ pub struct OpenapiArgs {
     pub json: bool,
 }
 
-/// Where the service keeps what it remembers.
+/// Where the service keeps its data.
 #[derive(Clone, Args)]
 pub struct StorageArgs {
-    /// Folder of the database and the uploaded files; created where it is missing.
+    /// Folder of the database and the uploaded files; created if missing.
     #[arg(long, env = "HELIOMAP_DATA_DIR", default_value = "heliomap-data", global = true, value_name = "DIR")]
     pub data_dir: PathBuf,
-    /// Postgres database to use in place of the SQLite file in the data folder, `postgres://USER:PASSWORD@HOST/NAME`.
+    /// Postgres database to use instead of the SQLite file in the data folder, `postgres://USER:PASSWORD@HOST/NAME`.
     #[arg(long, env = "HELIOMAP_DATABASE", hide_env_values = true, global = true, value_name = "URL")]
     pub database: Option<String>,
-    /// Place in an S3-compatible store for the uploaded files and the models, in place of the data folder,
-    /// `s3://BUCKET/PREFIX`. Endpoint, region and credentials come from the variables AWS_ENDPOINT_URL, AWS_REGION,
-    /// AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and the others that programs for S3 take.
+    /// S3-compatible store for uploaded files and models, instead of the data folder, `s3://BUCKET/PREFIX`. Endpoint, region
+    /// and credentials come from AWS_ENDPOINT_URL, AWS_REGION, AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and the other usual
+    /// variables.
     #[arg(long, env = "HELIOMAP_BLOBS", global = true, value_name = "URL")]
     pub blobs: Option<Bucket>,
 }
 
-/// The database's URL may hold a password, which no log shall.
+/// Omits the database's URL, which may hold a password.
 impl std::fmt::Debug for StorageArgs {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let mut known = f.debug_struct("StorageArgs");
@@ -243,23 +245,22 @@ impl std::fmt::Debug for StorageArgs {
     }
 }
 
-/// The detector where none is named.
+/// The default detector.
 const DETECTOR: &str = "both";
 
 /// What finds modules in photos.
 #[derive(Debug, Clone, Args)]
 pub struct DetectorArgs {
-    /// The detector: `unet`, `yolo` or `both` (they come with heliomap), or ONNX files of your own, one of each kind at most.
+    /// The detector: `unet`, `yolo` or `both` (shipped with heliomap), or your own ONNX files, at most one of each kind.
     #[arg(long, env = "HELIOMAP_DETECTOR", default_value = DETECTOR, value_delimiter = ',', value_name = "DETECTOR")]
     pub detector: Vec<String>,
-    /// What runs the detector: cpu, or cuda, tensorrt, migraphx, openvino, xnnpack, coreml, directml where
-    /// your ONNX Runtime (ORT_DYLIB_PATH) was built with it.
+    /// What runs the detector: `cpu`, or `cuda` if your ONNX Runtime (ORT_DYLIB_PATH) was built with it.
     #[arg(long, env = "HELIOMAP_EXECUTION_PROVIDER", default_value = "cpu", value_name = "PROVIDER")]
     pub execution_provider: ExecutionProvider,
 }
 
 impl DetectorArgs {
-    /// Whether models, what runs them, or ONNX Runtime's library were chosen, and not left as they are.
+    /// Whether the models, the execution provider or the library of ONNX Runtime differ from the defaults.
     pub fn is_own(&self) -> bool {
         self.detector != [DETECTOR]
             || self.execution_provider != ExecutionProvider::default()
@@ -275,6 +276,21 @@ impl DetectorArgs {
     }
 }
 
+/// The largest photo that single commands take.
+#[derive(Debug, Clone, Copy, Args)]
+pub struct ImageSizeArgs {
+    /// Largest image, in millions of pixels; checked before an image is decoded.
+    #[arg(long, alias = "max-megapixels", env = "HELIOMAP_MAX_IMAGE_MEGAPIXELS", default_value = "100", value_parser = parse_megapixels, value_name = "MP")]
+    pub max_image_megapixels: f64,
+}
+
+impl ImageSizeArgs {
+    /// The limit in pixels.
+    pub fn max_pixels(self) -> u64 {
+        (self.max_image_megapixels * 1e6) as u64
+    }
+}
+
 /// An origin as browsers write it: scheme, host and port, without a slash at the end.
 fn parse_origin(text: &str) -> Result<HeaderValue, String> {
     let host = text.strip_prefix("https://").or_else(|| text.strip_prefix("http://")).unwrap_or_default();
@@ -282,14 +298,6 @@ fn parse_origin(text: &str) -> Result<HeaderValue, String> {
     value.filter(|_| !host.is_empty() && !host.contains(['/', '*', '?', '#', ' '])).ok_or_else(|| {
         "an origin is a scheme and a host, such as https://dashboard.example.org, with nothing behind it".to_owned()
     })
-}
-
-fn parse_seconds(text: &str) -> Result<Duration, String> {
-    let seconds = text.parse::<f64>().map_err(|_| "a number of seconds is expected".to_owned())?;
-    match Duration::try_from_secs_f64(seconds) {
-        Ok(duration) if !duration.is_zero() => Ok(duration),
-        _ => Err("a positive number of seconds is expected".to_owned()),
-    }
 }
 
 #[cfg(test)]

@@ -3,7 +3,7 @@
 mod commands;
 
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
-use commands::output::tell;
+use commands::output::notify;
 use heliomap::config::{
     BackupArgs, DoctorArgs, KeysArgs, LogArgs, OpenapiArgs, OrganisationsArgs, RestoreArgs, ServeArgs, TraceArgs,
     VerifyArgs, WorkerArgs, file,
@@ -22,22 +22,22 @@ struct Cli {
     command: Command,
 }
 
-/// What to do.
+/// The commands.
 #[derive(Debug, Subcommand)]
 enum Command {
     /// Serve the HTTP API and the web page, with a worker inside.
     Serve(ServeArgs),
     /// Run mapping jobs for a service with the same data folder.
     Worker(WorkerArgs),
-    /// Make, list, rotate and revoke keys to the service.
+    /// Create, list, rotate and revoke keys to the service.
     Keys(KeysArgs),
-    /// List organisations, and say what each may keep.
+    /// List organisations and set their quotas.
     Organisations(OrganisationsArgs),
-    /// Put aside what a service with an SQLite database remembers; it may be running.
+    /// Back up a service with an SQLite database, running or not.
     Backup(BackupArgs),
-    /// Make a data folder of a backup.
+    /// Restore a backup into a new data folder.
     Restore(RestoreArgs),
-    /// Check that every file that the database names is there.
+    /// Check that every file that the database names exists.
     Verify(VerifyArgs),
     /// Map the plant in a folder as OpenSfM leaves it; no server is needed.
     Map(commands::map::MapArgs),
@@ -47,7 +47,7 @@ enum Command {
     Evaluate(commands::evaluate::EvaluateArgs),
     /// Measure a detector, or a file of boxes, against labelled photos.
     EvaluateDetection(commands::evaluate_detection::EvaluateDetectionArgs),
-    /// Check that what the service needs is there and works, and say what to do where it does not.
+    /// Check what the service needs, with advice for every fault.
     Doctor(DoctorArgs),
     /// Print the description of the HTTP API.
     Openapi(OpenapiArgs),
@@ -60,7 +60,7 @@ fn main() -> ExitCode {
     match parse().and_then(traced) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            tell(report(&error));
+            notify(report(&error));
             ExitCode::FAILURE
         }
     }
@@ -75,17 +75,17 @@ fn traced(cli: Cli) -> anyhow::Result<()> {
     outcome
 }
 
-/// An error for people: what failed, and of what caused it all that was not said yet. Most are mistakes of people, whom no
-/// backtrace helps.
+/// An error for people: what failed, and every cause whose text is not part of it already. There is no backtrace, because most
+/// errors are mistakes in the input.
 fn report(error: &anyhow::Error) -> String {
-    let mut said = format!("Error: {error}");
+    let mut report = format!("Error: {error}");
     for cause in error.chain().skip(1).map(ToString::to_string) {
-        if !said.contains(&cause) {
-            said.push_str("\n  because: ");
-            said.push_str(&cause);
+        if !report.contains(&cause) {
+            report.push_str("\n  because: ");
+            report.push_str(&cause);
         }
     }
-    said
+    report
 }
 
 fn run(command: Command) -> anyhow::Result<()> {
@@ -113,6 +113,7 @@ fn parse() -> anyhow::Result<Cli> {
         Some(path) => file::with_file(Cli::command(), &path)?,
         None => Cli::command(),
     };
+    let command = file::with_renamed_variables(command);
     Ok(Cli::from_arg_matches(&command.get_matches()).unwrap_or_else(|error| error.exit()))
 }
 
@@ -122,7 +123,7 @@ mod tests {
     use heliomap::config::Limits;
 
     #[test]
-    fn what_was_said_is_not_said_again() {
+    fn causes_are_not_repeated() {
         let cause = std::io::Error::from(std::io::ErrorKind::NotFound);
         let error = anyhow::anyhow!("a.jpg cannot be read: {cause}");
         let chain = anyhow::Error::from(cause).context("opening the door").context("getting in: opening the door");

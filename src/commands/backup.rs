@@ -1,4 +1,4 @@
-//! `heliomap backup`, `restore` and `verify`: what the service remembers, put aside and taken back, every blob checked.
+//! `heliomap backup`, `restore` and `verify`: the data of the service, with every blob checked.
 
 use super::output::print;
 use super::{ROWS, open_blobs, open_storage_there, run_async};
@@ -13,7 +13,7 @@ use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 use std::pin::pin;
 
-/// Written last: a backup without it is not whole.
+/// Written last: a backup without it is incomplete.
 const MANIFEST: &str = "backup.json";
 /// Blobs that are looked up at once.
 const LOOKS_AT_ONCE: usize = 16;
@@ -93,7 +93,7 @@ pub fn restore(args: RestoreArgs) -> anyhow::Result<()> {
             Ok(text) => serde_json::from_slice::<Manifest>(&text)
                 .with_context(|| format!("{} is not what `heliomap backup` writes", manifest.display()))?,
             Err(error) if error.kind() == ErrorKind::NotFound => {
-                bail!("{} is no whole backup: it has no {MANIFEST}", args.folder.display())
+                bail!("{} is not a complete backup: it has no {MANIFEST}", args.folder.display())
             }
             Err(error) => return Err(error).with_context(|| format!("reading {}", manifest.display())),
         };
@@ -121,11 +121,15 @@ pub fn restore(args: RestoreArgs) -> anyhow::Result<()> {
                 return Err(error);
             }
         };
-        ensure!(count == manifest.blobs, "the backup tells of {} blobs and holds {count}", manifest.blobs);
+        ensure!(
+            count == manifest.blobs,
+            "the manifest of the backup lists {} blobs, but it holds {count}",
+            manifest.blobs
+        );
         sync(&coming)?;
         std::fs::rename(&coming, &rows).with_context(|| format!("renaming {}", coming.display()))?;
         sync(data)?;
-        print(format_args!("{count} blobs and their rows are back, as of {}\n", manifest.created))
+        print(format_args!("restored {count} blobs and their rows, as of {}\n", manifest.created))
     })
 }
 
@@ -209,7 +213,7 @@ fn place(blob: &BlobRecord) -> PathBuf {
 fn only_sqlite(storage: &StorageArgs, what: &str) -> anyhow::Result<()> {
     ensure!(
         storage.database.is_none(),
-        "{what} and its blobs with the tools of their store; docs/OPERATION.md tells how"
+        "{what} and its blobs with the tools of their store; docs/OPERATION.md shows how"
     );
     Ok(())
 }

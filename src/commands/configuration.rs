@@ -1,4 +1,4 @@
-//! `heliomap configuration`: docs/CONFIGURATION.md, made from the command line as it is.
+//! `heliomap configuration`: docs/CONFIGURATION.md, generated from the command line.
 
 use super::output::print;
 use clap::{Arg, ArgAction, Command};
@@ -9,13 +9,16 @@ use std::fmt::Write;
 const INTRODUCTION: &str = "\
 # Configuration
 
-Every setting may be given as a flag, as an environment variable, or in a file. A flag goes before the environment, the
-environment before the file, the file before the default. `heliomap COMMAND --help` shows the flags of a command.
+A setting can be a flag, an environment variable, or a line of a file. A flag takes precedence over the environment, the
+environment over the file, the file over the default. `heliomap COMMAND --help` shows the flags of a command.
 
-The file is YAML: one line `flag: value` for each setting, the flag without its dashes; flags without a value take `true` or
-`false`, those that may be given more than once a list. `--config FILE` or `HELIOMAP_CONFIG` names it. One file does for all
-commands: each takes what it knows. A key that is no setting of any command is refused. A file that holds a password should be
-readable to the service alone (`chmod 600`).
+The file is YAML with one line `flag: value` for each setting, the flag without its dashes. Flags without a value take `true` or
+`false`, flags that may be repeated take a list. `--config FILE` or `HELIOMAP_CONFIG` names the file. One file serves all commands:
+each uses the settings that it has. A key that no command has is refused. Make a file with a password readable by the service only
+(`chmod 600`).
+
+Durations have a unit: `30s`, `10m`, `24h`, `400d`. Sizes too, in powers of 1024: `256M`, `8G`, `2T`. Bare numbers are bytes, and for
+durations the unit that version 0.1 used: seconds; days for `--keep-audit` and `--expires-after`; hours for `keys rotate --grace`.
 
 ```yaml
 listen: 0.0.0.0:8080
@@ -25,15 +28,15 @@ max-image-size: 128M
 cors-origin: [https://dashboard.example.org]
 ```
 
-`make configuration` writes this page from the command line as it is, and a test compares the two.
+`make configuration` generates this page from the command line, and a test compares the two.
 
 ";
 
-/// Flags that belong to a single run and not to the service: these have no environment variable.
+/// Flags without an environment variable, which belong to a single run.
 const RUNS: &str = "
 ## Flags of single runs
 
-These belong to one run of a command and are given as flags alone.
+These belong to one run of a command and have no environment variable.
 
 ";
 
@@ -57,7 +60,7 @@ pub fn document(command: &Command) -> String {
     collect(command, "", &mut rows);
     let mut text = INTRODUCTION.to_owned();
     text.push_str("| flag | environment | file | default | commands | meaning |\n|---|---|---|---|---|---|\n");
-    let told = |commands: &[String]| match commands {
+    let listed = |commands: &[String]| match commands {
         [all] if all.is_empty() => "all".to_owned(),
         commands => commands.join(", "),
     };
@@ -65,7 +68,7 @@ pub fn document(command: &Command) -> String {
         if let Some(variable) = &row.environment {
             let file = row.flag.trim_start_matches('-').split(' ').next().unwrap_or_default();
             let file = if file == FLAG { String::new() } else { format!("`{file}`") };
-            let commands = told(commands);
+            let commands = listed(commands);
             // Writing to a string does not fail.
             let _ = writeln!(
                 text,
@@ -77,7 +80,7 @@ pub fn document(command: &Command) -> String {
     text.push_str(RUNS);
     text.push_str("| flag | default | commands | meaning |\n|---|---|---|---|\n");
     for (row, commands) in rows.iter().filter(|(row, _)| row.environment.is_none()) {
-        let _ = writeln!(text, "| `{}` | {} | {} | {} |", row.flag, row.default, told(commands), row.meaning);
+        let _ = writeln!(text, "| `{}` | {} | {} | {} |", row.flag, row.default, listed(commands), row.meaning);
     }
     text
 }

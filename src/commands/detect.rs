@@ -1,9 +1,9 @@
 //! `heliomap detect`: photos in, boxes of modules out.
 
-use super::output::{Output, prepare_folder, tell};
+use super::output::{Output, notify, prepare_folder};
 use anyhow::{Context, bail};
 use clap::Args;
-use heliomap::config::DetectorArgs;
+use heliomap::config::{DetectorArgs, ImageSizeArgs};
 use heliomap_mapping::detection::{Detector, ImageDetections, external, scale};
 use heliomap_mapping::geometry::Camera;
 use heliomap_mapping::pipeline;
@@ -22,7 +22,7 @@ use std::time::Instant;
 #[derive(Debug, Args)]
 #[command(
     after_help = "A folder that holds reconstruction.json is searched as `heliomap map` does it: its photos are \
-                        undistorted, and the reconstruction tells their scale. The photos of any other folder, and single \
+                        undistorted, and the reconstruction gives their scale. The photos of any other folder, and single \
                         photos, are searched as they are.\n\n\
                         Example: heliomap detect my-survey --out boxes.json --overlay pictures"
 )]
@@ -30,24 +30,23 @@ pub struct DetectArgs {
     /// Photos, folders of photos, or folders as OpenSfM leaves them
     #[arg(required = true, value_name = "IMAGE")]
     images: Vec<PathBuf>,
-    /// File to write the boxes to, in place of standard output
+    /// File to write the boxes to, instead of standard output
     #[arg(short, long, value_name = "FILE")]
     out: Option<PathBuf>,
     /// Draw the boxes on the photos, into this folder
     #[arg(long, value_name = "DIR")]
     overlay: Option<PathBuf>,
-    /// Metres on the ground per pixel of the photos; else as the reconstruction or the drone's metadata tell, else by the
-    /// look of the modules
+    /// Metres on the ground per pixel of the photos. If absent, it comes from the reconstruction or the drone's metadata, or else
+    /// from the size of the modules
     #[arg(long, value_name = "M", value_parser = parse_gsd)]
     gsd: Option<f64>,
     #[command(flatten)]
     detector: DetectorArgs,
-    /// Threads to use; all cores where it is not given
+    /// Threads to use; all cores if absent
     #[arg(long, env = "HELIOMAP_THREADS", value_name = "N")]
     threads: Option<usize>,
-    /// Most megapixels that a photo may have
-    #[arg(long, env = "HELIOMAP_MAX_MEGAPIXELS", value_name = "MP", default_value_t = 100)]
-    max_megapixels: u64,
+    #[command(flatten)]
+    image_size: ImageSizeArgs,
     /// Print seconds per photo
     #[arg(long)]
     timings: bool,
@@ -86,7 +85,7 @@ pub fn run(args: &DetectArgs) -> anyhow::Result<()> {
         let detections = detector.detect(&picture, gsd_m)?;
         if args.timings {
             let seconds = begun.elapsed().as_secs_f64();
-            tell(format_args!("{}: {} modules, {seconds:.2} s", task.photo.shot, detections.len()));
+            notify(format_args!("{}: {} modules, {seconds:.2} s", task.photo.shot, detections.len()));
         }
         if let Some(folder) = &args.overlay {
             let stem = Path::new(&task.photo.shot).file_stem().unwrap_or_default().to_string_lossy().into_owned();
@@ -102,7 +101,7 @@ pub fn run(args: &DetectArgs) -> anyhow::Result<()> {
         Ok(())
     })?;
     if args.timings {
-        tell(format_args!("{} photos: {:.2} s", tasks.len(), start.elapsed().as_secs_f64()));
+        notify(format_args!("{} photos: {:.2} s", tasks.len(), start.elapsed().as_secs_f64()));
     }
     output.write_json(&external::to_file(&results))?;
     let found: usize = results.iter().map(|image| image.detections.len()).sum();
@@ -144,7 +143,7 @@ pub fn scale_of(
 }
 
 fn tasks(args: &DetectArgs) -> anyhow::Result<Vec<Task>> {
-    let max_pixels = args.max_megapixels.saturating_mul(1_000_000);
+    let max_pixels = args.image_size.max_pixels();
     let mut tasks = Vec::new();
     for path in &args.images {
         if path.join("reconstruction.json").is_file() {

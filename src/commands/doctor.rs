@@ -1,4 +1,4 @@
-//! `heliomap doctor`: whether what the service needs is there and works, and what to do where it does not.
+//! `heliomap doctor`: checks what the service needs, with advice for every fault.
 
 use super::output::print;
 use super::{ROWS, open_blobs, run_async};
@@ -25,7 +25,7 @@ const TRIAL_PX: u32 = 512;
 #[serde(rename_all = "lowercase")]
 enum Verdict {
     Ok,
-    /// The service runs, but whoever runs it should know.
+    /// The service runs, but its operator should know.
     Warning,
     Failed,
 }
@@ -110,21 +110,21 @@ fn chain(error: &anyhow::Error) -> String {
     format!("{error:#}")
 }
 
-/// Who gets in.
+/// Access to the service.
 fn configuration(args: &ServeArgs) -> Check {
     let listen = args.listen;
     match (args.insecure, listen.ip().is_loopback()) {
         (true, true) => Check::warning(
             "configuration",
-            format!("--insecure: whoever reaches {listen} on this machine may do everything"),
-            "leave --insecure out where others use this machine, and make keys with `heliomap keys create`",
+            format!("--insecure: everyone who can reach {listen} on this machine may do everything"),
+            "omit --insecure if others use this machine, and create keys with `heliomap keys create`",
         ),
         (true, false) => Check::failed(
             "configuration",
             format!("--insecure on {listen}, which is no loopback address: the service will not start"),
-            "leave --insecure out, and make keys with `heliomap keys create`",
+            "omit --insecure, and create keys with `heliomap keys create`",
         ),
-        (false, _) => Check::ok("configuration", format!("listens on {listen} and asks for keys")),
+        (false, _) => Check::ok("configuration", format!("listens on {listen} and requires keys")),
     }
 }
 
@@ -219,17 +219,17 @@ async fn database(args: &ServeArgs) -> Check {
     let found = format!("{what} answers, is of this version and can be written to");
     if !has_keys && !args.insecure {
         let advice =
-            "make the first key with `heliomap keys create --scope admin --name NAME`: nobody gets in without one";
+            "create the first key with `heliomap keys create --scope admin --name NAME`; every request needs one";
         return Check::warning(NAME, format!("{found}; it holds no key"), advice);
     }
     if let Some(url) = &args.storage.database
         && !PostgresStore::is_guarded(url).unwrap_or(true)
     {
-        let advice = "have the connection encrypted and its certificate checked: add ?sslmode=verify-full to --database, and \
-                      &sslrootcert=FILE where the certificate is of an authority of your own";
+        let advice = "encrypt the connection and check its certificate: add ?sslmode=verify-full to --database, and &sslrootcert=FILE \
+                      if the certificate is from your own authority";
         return Check::warning(
             NAME,
-            format!("{found}; whoever is in between may read and change what is said"),
+            format!("{found}; the connection is not protected against others on the network"),
             advice,
         );
     }
@@ -265,7 +265,7 @@ async fn storage(args: &ServeArgs) -> Check {
     }
 }
 
-/// ONNX Runtime and the models: they load, and look at a picture.
+/// ONNX Runtime and the models: they load, and search an image.
 async fn detector(args: &ServeArgs) -> Check {
     const NAME: &str = "detector";
     let detector = args.detector.clone();
@@ -278,7 +278,7 @@ async fn detector(args: &ServeArgs) -> Check {
     });
     match tried.await {
         Ok(Ok((described, took))) => {
-            Check::ok(NAME, format!("{described}; looked at {TRIAL_PX} x {TRIAL_PX} pixels in {} ms", took.as_millis()))
+            Check::ok(NAME, format!("{described}; searched {TRIAL_PX} x {TRIAL_PX} pixels in {} ms", took.as_millis()))
         }
         Ok(Err(error)) => {
             let advice = match error {
@@ -287,9 +287,7 @@ async fn detector(args: &ServeArgs) -> Check {
                 | DetectionError::ProviderMissing { .. } => {
                     "jobs fail without it; set ORT_DYLIB_PATH to the library of an ONNX Runtime that works here"
                 }
-                _ => {
-                    "jobs fail without it; ONNX Runtime works, so name models with --detector that are there and whole"
-                }
+                _ => "jobs fail without it; ONNX Runtime works, so name valid models with --detector",
             };
             Check::failed(NAME, error.to_string(), advice)
         }
@@ -309,7 +307,7 @@ fn certificates() -> Check {
         Ok(_) => Check::ok(NAME, "other services can be checked by the certificates of this machine"),
         Err(error) => Check::warning(
             NAME,
-            format!("webhooks cannot be told: {}", chain(&error.into())),
+            format!("no messages can be sent to webhooks: {}", chain(&error.into())),
             "install the certificates of public authorities, on Debian the package ca-certificates",
         ),
     }
@@ -318,8 +316,7 @@ fn certificates() -> Check {
 /// The keys of the identity provider, where there is one.
 async fn identity_provider(args: &ServeArgs) -> Check {
     const NAME: &str = "identity provider";
-    const ADVICE: &str =
-        "see that --oidc-issuer is the provider's issuer to the letter, and that this machine may ask it";
+    const ADVICE: &str = "check that --oidc-issuer is the exact issuer, and that this machine can reach the provider";
     let settings = match args.oidc.settings() {
         Ok(None) => return Check::ok(NAME, "none is configured"),
         Ok(Some(settings)) => settings,

@@ -16,7 +16,7 @@ pub struct EvaluateArgs {
     plant: PathBuf,
     /// What it should be: a truth.json, or GeoJSON of modules.
     truth: PathBuf,
-    /// Write everything as JSON too; `-` prints it in place of the text.
+    /// Write everything as JSON too; `-` prints it instead of the text.
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
     /// Draw differences, spacing and the plant from above as SVG into this folder.

@@ -15,7 +15,7 @@ use std::path::{Path, PathBuf};
 /// Measure a detector, or a file of boxes, against labelled photos.
 ///
 /// Recall, precision, mean intersection over union, centre error, splits and merges of the modules wholly inside the frame,
-/// per plant, condition and photo; modules under glare are told apart.
+/// per plant, condition and photo; modules under glare are counted separately.
 #[derive(Debug, Args)]
 #[command(after_help = "Labels are a truth.json with camera, modules and shots, a folder that holds one, or a file\n\
                         {\"photo\": {\"modules\": [[[x, y] x 4]], \"ignore\": [polygon]}} in pixels of the photo.\n\n\
@@ -24,23 +24,23 @@ pub struct EvaluateDetectionArgs {
     /// Labels: one or more
     #[arg(required = true, value_name = "LABELS")]
     labels: Vec<PathBuf>,
-    /// Folder of the photos, where they are not beside the labels
+    /// Folder of the photos, if they are not beside the labels
     #[arg(long, value_name = "DIR")]
     images: Option<PathBuf>,
     /// Measure these boxes (pixels of the photos as they are) instead of running a detector
     #[arg(long, value_name = "FILE")]
     detections: Option<PathBuf>,
-    /// Metres on the ground per pixel of the photos; else as the truth's cameras have it (as a reconstruction tells it when
-    /// a plant is mapped), else as `heliomap detect` finds it
+    /// Metres on the ground per pixel of the photos. If absent, it comes from the truth's cameras, as from a reconstruction when
+    /// a plant is mapped, or else as in `heliomap detect`
     #[arg(long, value_name = "M", value_parser = parse_gsd)]
     gsd: Option<f64>,
-    /// Leave aside what the truth's cameras tell of the scale
+    /// Ignore the scale that the truth's cameras give
     #[arg(long)]
     unknown_scale: bool,
     /// Print the figures of every photo, too
     #[arg(long)]
     photos: bool,
-    /// Write everything as JSON too; `-` prints it in place of the text
+    /// Write everything as JSON too; `-` prints it instead of the text
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
     /// Draw boxes on the photos into this folder: missed modules red, false boxes orange
@@ -48,7 +48,7 @@ pub struct EvaluateDetectionArgs {
     overlay: Option<PathBuf>,
     #[command(flatten)]
     detector: DetectorArgs,
-    /// Threads to use; all cores where it is not given
+    /// Threads to use; all cores if absent
     #[arg(long, env = "HELIOMAP_THREADS", value_name = "N")]
     threads: Option<usize>,
 }
@@ -144,7 +144,7 @@ fn measure(
     Ok(score)
 }
 
-/// Photos are told by their names, with or without the ending.
+/// Compares the names of photos, with or without the ending.
 fn is_same_photo(a: &str, b: &str) -> bool {
     a == b || Path::new(a).file_stem() == Path::new(b).file_stem()
 }

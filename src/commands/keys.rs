@@ -1,12 +1,12 @@
-//! `heliomap keys`: keys made by whoever runs the service, the first one of each organisation among them.
+//! `heliomap keys`: the operator manages keys, among them the first one of each organisation.
 
-use super::output::{print, print_once, tell};
+use super::output::{notify, print, print_once};
 use super::{open_storage_beside, open_storage_there, run_async};
 use anyhow::{Context, bail};
 use heliomap::config::{KeysArgs, KeysCommand};
 use heliomap::store::{ApiKey, Created, KeyId, NewKey, OrganisationId, Page, Secret, Store, TimeSpan};
 use heliomap_model::PlantId;
-use jiff::{SignedDuration, Timestamp};
+use jiff::Timestamp;
 
 /// Runs the command.
 pub fn run(args: KeysArgs) -> anyhow::Result<()> {
@@ -17,7 +17,7 @@ pub fn run(args: KeysArgs) -> anyhow::Result<()> {
         };
         let now = Timestamp::now();
         match args.command {
-            KeysCommand::Create { name, scope, organisation, plant, days } => {
+            KeysCommand::Create { name, scope, organisation, plant, expires_after } => {
                 let organisation = organisation_named(&*store, &organisation, now).await?;
                 let plants: Vec<PlantId> = plant;
                 for id in &plants {
@@ -33,14 +33,14 @@ pub fn run(args: KeysArgs) -> anyhow::Result<()> {
                     secret: secret.record(),
                     scopes: scope.into_iter().collect(),
                     plants: (!plants.is_empty()).then_some(plants),
-                    expires: days.map(|days| now + SignedDuration::from_hours(24 * i64::from(days))),
+                    expires: expires_after.map(|duration| now.checked_add(duration)).transpose()?,
                 };
                 let key = store.create_key(&new, now).await?;
-                tell(format_args!("key {} is made; its secret is shown this once:", key.id));
+                notify(format_args!("key {} is created; its secret is shown only now:", key.id));
                 if let Err(error) = print_once(format_args!("{}\n", secret.reveal())) {
                     store.revoke_key(organisation, key.id, None, now).await?;
                     return Err(error)
-                        .context(format!("nobody can have read the secret of key {}: it is revoked", key.id));
+                        .context(format!("the secret of key {} could not be printed: the key is revoked", key.id));
                 }
             }
             KeysCommand::List => {
@@ -57,17 +57,17 @@ pub fn run(args: KeysArgs) -> anyhow::Result<()> {
             KeysCommand::Revoke { id } => {
                 let key = key_of_any(&*store, id).await?;
                 store.revoke_key(key.organisation, id, None, now).await?;
-                tell(format_args!("key {id} ({}) opens nothing any more", key.name));
+                notify(format_args!("key {id} ({}) is revoked", key.name));
             }
-            KeysCommand::Rotate { id, grace_hours } => {
+            KeysCommand::Rotate { id, grace } => {
                 let key = key_of_any(&*store, id).await?;
                 let secret = Secret::random()?;
-                let until = now + SignedDuration::from_hours(i64::from(grace_hours));
+                let until = now.checked_add(grace)?;
                 let rotated = store.rotate_key(key.organisation, id, None, &secret.record(), until).await?;
                 rotated.with_context(|| format!("key {id} is revoked; make another with `heliomap keys create`"))?;
-                tell(format_args!("key {id} ({}) has a new secret, which is shown this once:", key.name));
+                notify(format_args!("key {id} ({}) has a new secret, which is shown only now:", key.name));
                 print_once(format_args!("{}\n", secret.reveal())).with_context(|| {
-                    format!("nobody can have read the new secret of key {id}: rotate it once more, or revoke it")
+                    format!("the new secret of key {id} could not be printed: rotate it once more, or revoke it")
                 })?;
             }
         }
@@ -81,7 +81,7 @@ async fn organisation_named(store: &dyn Store, name: &str, now: Timestamp) -> an
     })
 }
 
-/// The key, whosever it is.
+/// The key with an identifier, of any organisation.
 async fn key_of_any(store: &dyn Store, id: KeyId) -> anyhow::Result<ApiKey> {
     let mut after = None;
     loop {

@@ -1,11 +1,11 @@
 //! `heliomap map`: a folder in, a plant out, no server.
 
-use super::output::{Output, prepare_folder, print, tell};
+use super::output::{Output, notify, prepare_folder, print};
 use anyhow::{Context, bail, ensure};
 use clap::Args;
-use heliomap::config::DetectorArgs;
+use heliomap::config::{DetectorArgs, ImageSizeArgs, StartJob};
 use heliomap_mapping::pipeline::{self, Boxes, MapOptions, Observer, Stage, Subject};
-use heliomap_mapping::refinement::{Control, Method};
+use heliomap_mapping::refinement::Method;
 use heliomap_model::{Layer, PlantId, PlantModel};
 use heliomap_overlay as overlay;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
@@ -27,60 +27,36 @@ pub struct MapArgs {
     /// `--layers`
     #[arg(short, long, value_name = "FILE", default_value = "plant.geojson")]
     out: PathBuf,
-    /// Write sectors, benches and lines too, as FILE-sectors.geojson and so on
+    /// Also write sectors, benches and lines, as FILE-sectors.geojson and so on
     #[arg(long)]
     layers: bool,
     /// Draw detections, rows, gaps, hypotheses and labels on the photos, and the plant from above, into this folder
     #[arg(long, value_name = "DIR")]
     overlay: Option<PathBuf>,
-    /// Take these boxes instead of searching the images (the form that detectors write)
+    /// Use these boxes instead of searching the images (the format of `heliomap detect`)
     #[arg(long, value_name = "FILE")]
     detections: Option<PathBuf>,
     #[command(flatten)]
     detector: DetectorArgs,
-    /// Threads to use; all cores where it is not given
+    /// Threads to use; all cores if absent
     #[arg(long, env = "HELIOMAP_THREADS", value_name = "N")]
     threads: Option<usize>,
     /// Name of the plant: the same name gives the same identifiers
     #[arg(long, value_name = "NAME")]
     plant: Option<String>,
-    /// Model of an earlier survey (the --model-out of that run), whose identifiers live on
+    /// Model of an earlier survey (the --model-out of that run), whose identifiers are kept
     #[arg(long, value_name = "FILE")]
     previous: Option<PathBuf>,
     /// Write the whole model as JSON, for --previous of the next survey
     #[arg(long, value_name = "FILE")]
     model_out: Option<PathBuf>,
-    /// Rows of modules per bench, if all have the same; inferred otherwise
-    #[arg(long, value_name = "N")]
-    rows_per_bench: Option<u32>,
-    /// Coarsest ground sampling distance of images to search, metres per pixel [default: 0.06]
-    #[arg(long, value_name = "M")]
-    max_gsd: Option<f64>,
-    /// Known spacing of module centres along and across the row in metres, for example 1.02,1.67: fixes the scale
-    #[arg(long, value_name = "ALONG,ACROSS", value_delimiter = ',')]
-    spacing: Option<Vec<f64>>,
-    /// Known size of a module's face in metres, width along the row and height across it, for example 1.00,1.65: fixes
-    /// the scale
-    #[arg(long, value_name = "WIDTH,HEIGHT", value_delimiter = ',', conflicts_with = "spacing")]
-    module_size: Option<Vec<f64>>,
-    /// Control points and known modules to align the model by, a JSON file (docs/PIPELINE.md tells its form)
-    #[arg(long, value_name = "FILE")]
-    control: Option<PathBuf>,
-    /// Whether control sets the scale too [default: unless --spacing or --module-size does]
-    #[arg(long, value_name = "BOOL", requires = "control")]
-    control_scale: Option<bool>,
-    /// What heights refer to, stated in the model, for example "EGM2008 height"
-    #[arg(long, value_name = "NAME")]
-    vertical_datum: Option<String>,
+    #[command(flatten)]
+    options: StartJob,
     /// How positions are refined
     #[arg(long, value_enum, default_value_t = MethodArg::Lattice)]
     refinement: MethodArg,
-    /// Most megapixels that an image may have
-    #[arg(long, env = "HELIOMAP_MAX_MEGAPIXELS", value_name = "MP", default_value_t = 100)]
-    max_megapixels: u64,
-    /// Seed of every random choice
-    #[arg(long, default_value_t = 1)]
-    seed: u64,
+    #[command(flatten)]
+    image_size: ImageSizeArgs,
     /// Print seconds and peak memory of every stage
     #[arg(long)]
     timings: bool,
@@ -103,24 +79,13 @@ pub fn run(args: &MapArgs) -> anyhow::Result<()> {
     let cores = std::thread::available_parallelism().map_or(2, usize::from);
     let threads = args.threads.unwrap_or(cores).max(1);
     rayon::ThreadPoolBuilder::new().num_threads(threads).build_global().context("starting the threads")?;
-    let spacing_m =
-        two_lengths(args.spacing.as_deref(), "--spacing takes two lengths in metres, along and across the row")?;
-    let module_size_m =
-        two_lengths(args.module_size.as_deref(), "--module-size takes two lengths in metres, width and height")?;
     let options = MapOptions {
-        rows_per_bench: args.rows_per_bench,
-        max_gsd_m_per_px: args.max_gsd,
-        spacing_m,
-        module_size_m,
-        control: args.control.as_deref().map(read_control).transpose()?,
-        control_scale: args.control_scale,
-        vertical_datum: args.vertical_datum.clone(),
         refinement: match args.refinement {
             MethodArg::Lattice => Method::Lattice,
             MethodArg::Paper => Method::Paper,
         },
-        max_image_pixels: args.max_megapixels.saturating_mul(1_000_000),
-        seed: args.seed,
+        max_image_pixels: args.image_size.max_pixels(),
+        ..args.options.clone().into_options().map_err(anyhow::Error::msg)?
     };
     let folder_name = args.folder.canonicalize().ok().and_then(|f| Some(f.file_name()?.to_string_lossy().into_owned()));
     let survey = folder_name.unwrap_or_else(|| args.folder.display().to_string());
@@ -180,21 +145,21 @@ pub fn run(args: &MapArgs) -> anyhow::Result<()> {
             args.out.display()
         )?;
         match outputs.take_stdout() {
-            true => tell(summary.trim_end()),
+            true => notify(summary.trim_end()),
             false => print(summary)?,
         }
     }
     if args.timings {
-        tell(format_args!("{:<10} {:>9} {:>14}", "stage", "seconds", "peak memory"));
+        notify(format_args!("{:<10} {:>9} {:>14}", "stage", "seconds", "peak memory"));
         for timing in &mapping.timings {
             let memory = timing.peak_memory_bytes.map_or_else(|| "?".to_owned(), |b| format!("{} MB", b / 1_000_000));
-            tell(format_args!("{:<10} {:>9.3} {:>14}", timing.stage.as_str(), timing.wall.as_secs_f64(), memory));
+            notify(format_args!("{:<10} {:>9.3} {:>14}", timing.stage.as_str(), timing.wall.as_secs_f64(), memory));
         }
     }
     Ok(())
 }
 
-/// What the command writes, looked at before it works.
+/// What the command writes, checked before it works.
 struct Outputs {
     layers: Vec<(Layer, Output)>,
     model: Option<Output>,
@@ -229,25 +194,6 @@ impl Outputs {
         let layers = self.layers.iter().map(|(_, output)| output);
         layers.chain(&self.model).any(|output| *output == Output::Stdout)
     }
-}
-
-fn two_lengths(given: Option<&[f64]>, expected: &'static str) -> anyhow::Result<Option<[f64; 2]>> {
-    match given {
-        None => Ok(None),
-        Some(&[first, second]) => Ok(Some([first, second])),
-        Some(_) => bail!(expected),
-    }
-}
-
-fn read_control(path: &Path) -> anyhow::Result<Control> {
-    const MOST_BYTES: u64 = 64 << 20;
-    let what = || format!("reading {}", path.display());
-    let file = std::fs::File::open(path).with_context(what)?;
-    if file.metadata().with_context(what)?.len() > MOST_BYTES {
-        bail!("{} is larger than {MOST_BYTES} bytes, more than control points need", path.display());
-    }
-    serde_json::from_reader(std::io::BufReader::new(file))
-        .with_context(|| format!("{} is no file of control points as docs/PIPELINE.md describes it", path.display()))
 }
 
 fn read_model(path: &Path) -> anyhow::Result<PlantModel> {
@@ -294,7 +240,7 @@ impl Observer for Report {
             && *last != Some((stage, tenth))
         {
             *last = Some((stage, tenth));
-            tell(format_args!("{}: {done} of {total}", stage.as_str()));
+            notify(format_args!("{}: {done} of {total}", stage.as_str()));
         }
     }
 }

@@ -1,4 +1,4 @@
-//! One file per command. Here alone, concrete backends are named.
+//! One file per command. Concrete databases and blob stores are named here only.
 
 pub mod backup;
 pub mod configuration;
@@ -23,7 +23,7 @@ use heliomap::store::schema::Schema;
 use heliomap::store::{Blobs, PostgresStore, SqliteStore, Store, StoreError};
 use heliomap::telemetry::metrics::{self, Metrics, Scrape};
 use heliomap::webhooks::{Sender, SenderSettings};
-use jiff::{SignedDuration, Timestamp};
+use jiff::Timestamp;
 use object_store::aws::AmazonS3Builder;
 use std::path::Path;
 use std::sync::Arc;
@@ -36,16 +36,16 @@ use tokio_util::sync::CancellationToken;
 /// The database of a data folder.
 const ROWS: &str = "heliomap.db";
 
-/// What a crash left among the uploads is deleted after this time.
+/// Leftovers of crashes among the uploads are deleted after this time.
 const STALE_UPLOADS: Duration = Duration::from_secs(24 * 3600);
 
-/// Messages to webhooks are forgotten so long after they arrived or were given up.
+/// Webhook deliveries are deleted so long after they succeeded or were given up.
 const OLD_DELIVERIES: Duration = Duration::from_secs(30 * 24 * 3600);
 
-/// How often, at the least, it is looked for what is over.
+/// Longest time between two removals of expired data.
 const TIDY_EVERY: Duration = Duration::from_secs(600);
 
-/// What is said of a data folder that cannot be used.
+/// The error for a data folder that cannot be used.
 fn unusable(folder: &Path) -> String {
     format!("cannot use the data folder {}; choose another with --data-dir", folder.display())
 }
@@ -73,7 +73,7 @@ async fn open_storage(args: &StorageArgs) -> anyhow::Result<(Arc<dyn Store>, Blo
     let blobs = open_blobs(args).await?;
     blobs.sweep_staging(STALE_UPLOADS).await.with_context(hint)?;
     let store: Arc<dyn Store> = match &args.database {
-        // The URL may hold a password: it is not said again.
+        // The URL may hold a password: the error does not repeat it.
         Some(url) => Arc::new(PostgresStore::open(url).await.context("cannot use the database of --database")?),
         None => Arc::new(SqliteStore::open(&folder.join(ROWS)).await.with_context(hint)?),
     };
@@ -81,7 +81,7 @@ async fn open_storage(args: &StorageArgs) -> anyhow::Result<(Arc<dyn Store>, Blo
     Ok((store, blobs))
 }
 
-/// Forgets what has had its time, and deletes what belonged to it.
+/// Deletes expired data.
 async fn forget_what_is_over(store: &dyn Store, blobs: &Blobs) -> Result<(), StoreError> {
     store.delete_expired_uploads(Timestamp::now()).await?;
     store.forget_old_requests(Timestamp::now()).await?;
@@ -122,7 +122,7 @@ fn only_of_this_version(schema: Schema) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// As [`open_storage_beside`], for commands that make nothing new: where no service has been, that is told.
+/// As [`open_storage_beside`], for commands that create nothing: a missing service is an error.
 async fn open_storage_there(args: &StorageArgs) -> anyhow::Result<(Arc<dyn Store>, Blobs)> {
     let (folder, schema) = (&args.data_dir, schema_of(args).await?);
     match &args.database {
@@ -143,8 +143,8 @@ async fn open_storage_there(args: &StorageArgs) -> anyhow::Result<(Arc<dyn Store
     open_storage(args).await
 }
 
-/// The pipeline, its detector opened. Where that fails, whoever named models or a runtime must hear of it; a service without
-/// any still takes uploads, and maps surveys that have boxes of their own.
+/// The pipeline with its detector opened. If that fails, it is an error if the user chose models or a runtime. A service without
+/// a detector still takes uploads, and maps surveys that have boxes of their own.
 async fn pipeline_mapper(args: &DetectorArgs) -> anyhow::Result<Arc<PipelineMapper>> {
     let detector = args.clone();
     let mapper = Arc::new(PipelineMapper::new(Box::new(move || Ok(detector.open(0)?.into()))));
@@ -152,7 +152,7 @@ async fn pipeline_mapper(args: &DetectorArgs) -> anyhow::Result<Arc<PipelineMapp
     match tokio::task::spawn_blocking(move || opening.open()).await? {
         Ok(()) => {}
         Err(error) if args.is_own() => return Err(error).context("cannot use the detector"),
-        Err(error) => tracing::warn!(%error, "there is no detector: jobs that need one fail"),
+        Err(error) => tracing::warn!(%error, "no detector: jobs that need one will fail"),
     }
     Ok(mapper)
 }
@@ -177,7 +177,7 @@ fn pipeline_worker(
     }
 }
 
-/// Sends messages to webhooks beside what else the process does, until it stops.
+/// Sends messages to webhooks in the background, until the process stops.
 fn send_messages(
     args: &WebhookArgs,
     store: &Arc<dyn Store>,
@@ -197,21 +197,21 @@ fn send_messages(
     })
 }
 
-/// Deletes what is over, and bytes that nothing needs any more, beside what else the process does, until it stops.
+/// Deletes expired data and unused blobs in the background, until the process stops.
 fn keep_tidy(args: &RetentionArgs, store: &Arc<dyn Store>, blobs: &Blobs, stop: &CancellationToken) {
     let (store, blobs, stop, kept) = (store.clone(), blobs.clone(), stop.clone(), args.keep_replaced);
-    let audited = SignedDuration::from_hours(24 * i64::from(args.keep_audit));
+    let audited = args.keep_audit;
     tokio::spawn(async move {
         loop {
             let tidied = async {
                 forget_what_is_over(&*store, &blobs).await?;
-                store.forget_audit(Timestamp::now() - audited).await?;
-                free_unused(&*store, &blobs, Timestamp::now().checked_sub(kept).unwrap_or(Timestamp::MIN)).await
+                store.forget_audit(before(audited)).await?;
+                free_unused(&*store, &blobs, before(kept)).await
             };
             match tidied.await {
                 Ok(0) => {}
-                Ok(freed) => tracing::info!(blobs = freed, "bytes that nothing needs any more are deleted"),
-                Err(error) => tracing::warn!(%error, "what is over cannot be deleted now"),
+                Ok(freed) => tracing::info!(blobs = freed, "unused blobs deleted"),
+                Err(error) => tracing::warn!(%error, "cannot delete expired data now"),
             }
             tokio::select! {
                 () = stop.cancelled() => return,
@@ -221,7 +221,7 @@ fn keep_tidy(args: &RetentionArgs, store: &Arc<dyn Store>, blobs: &Blobs, stop: 
     });
 }
 
-/// Serves what the process counts, where that is asked for, until it stops.
+/// Serves the metrics of the process, if configured, until it stops.
 async fn serve_metrics(args: &MetricsArgs, scrape: Scrape, stop: &CancellationToken) -> anyhow::Result<()> {
     let Some(address) = args.metrics_listen else { return Ok(()) };
     let listener = TcpListener::bind(address).await;
@@ -233,7 +233,12 @@ async fn serve_metrics(args: &MetricsArgs, scrape: Scrape, stop: &CancellationTo
     Ok(())
 }
 
-/// Runs a service until its end; what then still runs is given a moment and left behind.
+/// The time that lies so far back, or the earliest that there is.
+fn before(duration: Duration) -> Timestamp {
+    Timestamp::now().checked_sub(duration).unwrap_or(Timestamp::MIN)
+}
+
+/// Runs a service until its end; tasks that still run then get one second.
 fn run_async(service: impl Future<Output = anyhow::Result<()>>) -> anyhow::Result<()> {
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
     let outcome = runtime.block_on(service);
@@ -241,7 +246,7 @@ fn run_async(service: impl Future<Output = anyhow::Result<()>>) -> anyhow::Resul
     outcome
 }
 
-/// Is cancelled when the process is told to stop.
+/// A token that is cancelled when the process receives a signal to stop.
 fn stop_signal() -> anyhow::Result<CancellationToken> {
     use tokio::signal::unix::{SignalKind, signal};
     let stop = CancellationToken::new();

@@ -1,4 +1,4 @@
-//! `heliomap organisations`: who there is, what each keeps and may keep.
+//! `heliomap organisations`: their usage and quotas.
 
 use super::output::print;
 use super::{open_storage_beside, open_storage_there, run_async};

@@ -29,12 +29,12 @@ fn write_stdout(text: &dyn fmt::Display) -> std::io::Result<()> {
     stdout.flush()
 }
 
-/// Tells people something beside the output, on standard error; where that is closed, nobody listens.
-pub fn tell(text: impl fmt::Display) {
+/// Writes a message to standard error, beside the output; a closed standard error is ignored.
+pub fn notify(text: impl fmt::Display) {
     let _ = writeln!(std::io::stderr(), "{text}");
 }
 
-/// Where a document goes that people asked for.
+/// Where a document is written.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Output {
     /// `-`, or one of the names that the system has for it.
@@ -43,7 +43,7 @@ pub enum Output {
 }
 
 impl Output {
-    /// What a person named, looked at before the work begins.
+    /// The output that a path names, checked before the work begins.
     ///
     /// # Errors
     /// A folder, a file in a folder that is not there, and one that cannot be written.

@@ -14,13 +14,13 @@ use std::sync::Arc;
 use tokio::net::TcpListener;
 use tokio::sync::Notify;
 
-/// Serves until the process is told to stop.
+/// Serves until the process receives a signal to stop.
 pub fn run(args: ServeArgs) -> anyhow::Result<()> {
     run_async(async {
         anyhow::ensure!(
             !args.insecure || args.listen.ip().is_loopback(),
-            "--insecure lets anyone in who reaches {}: listen on a loopback address such as 127.0.0.1:8080, or leave \
-             --insecure out and make keys with `heliomap keys create`",
+            "--insecure gives access to everyone who can reach {}: listen on a loopback address such as 127.0.0.1:8080, or \
+             omit --insecure and create keys with `heliomap keys create`",
             args.listen
         );
         let oidc = args.oidc.settings().map_err(anyhow::Error::msg)?.map(Oidc::new).transpose();
@@ -65,7 +65,7 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
         let serving = tokio::spawn(async move { http::serve(listener, app, &limits, closing).await });
         if !args.insecure && store.keys(None, TimeSpan::default(), Page { after: None, limit: 1 }).await?.is_empty() {
             tracing::warn!(
-                "there is no key yet, so nobody gets in: make the first with `heliomap keys create --scope admin --name NAME` \
+                "no keys exist, so every request is refused: create the first with `heliomap keys create --scope admin --name NAME` \
                  on the same data folder"
             );
         }
@@ -86,7 +86,7 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
         match tokio::time::timeout(args.stop.grace, ending).await {
             Ok(outcome) => outcome,
             Err(_) => {
-                tracing::warn!("some requests or a job did not end in time; jobs left behind are taken up again");
+                tracing::warn!("some requests or a job did not end in time; the jobs will be resumed");
                 Ok(())
             }
         }

@@ -9,7 +9,7 @@ use heliomap::telemetry::metrics::{Metrics, Scrape};
 use std::sync::Arc;
 use tokio::sync::Notify;
 
-/// Runs jobs until the process is told to stop.
+/// Runs jobs until the process receives a signal to stop.
 pub fn run(args: WorkerArgs) -> anyhow::Result<()> {
     run_async(async {
         let mapper = pipeline_mapper(&args.detector).await?;

@@ -1,11 +1,12 @@
-//! Keys and organisations, as whoever runs the service makes them.
+//! Keys and organisations, as the operator of the service manages them.
 
 use super::StorageArgs;
-use super::limits::parse_size;
+use super::units::{parse_days, parse_grace, parse_size};
 use crate::store::usage::UNLIMITED;
 use crate::store::{KeyId, Scope, name};
 use clap::{Args, Subcommand};
 use heliomap_model::PlantId;
+use std::time::Duration;
 
 /// `heliomap keys`.
 #[derive(Debug, Clone, Args)]
@@ -16,30 +17,30 @@ pub struct KeysArgs {
     pub command: KeysCommand,
 }
 
-/// What is done about keys.
+/// Actions on keys.
 #[derive(Debug, Clone, Subcommand)]
 pub enum KeysCommand {
-    /// Make a key and print its secret, which is kept nowhere.
+    /// Create a key and print its secret, which is not stored.
     Create {
-        /// What people call it.
+        /// A name for people.
         #[arg(long, value_parser = parse_name, value_name = "NAME")]
         name: String,
-        /// What it is good for; may be given more than once.
+        /// A scope of the key; may be repeated.
         #[arg(long, value_enum, value_name = "SCOPE", required = true)]
         scope: Vec<Scope>,
-        /// The organisation that it belongs to, by name; made where there is none.
+        /// Name of the organisation that the key belongs to; created if missing.
         #[arg(long, value_parser = parse_name, value_name = "NAME", default_value = "default")]
         organisation: String,
-        /// A plant that it is good for; may be given more than once; all plants where it is not given.
+        /// A plant that the key may access; may be repeated. All plants if absent.
         #[arg(long, value_name = "UUID")]
         plant: Vec<PlantId>,
-        /// Days after which it ends, 1 to 36500; never where it is not given.
-        #[arg(long, value_parser = clap::value_parser!(u32).range(1..=36_500), value_name = "N")]
-        days: Option<u32>,
+        /// Time after which the key expires, 1d to 36500d; never if absent.
+        #[arg(long, alias = "days", value_parser = parse_days, value_name = "DURATION")]
+        expires_after: Option<Duration>,
     },
     /// List all keys.
     List,
-    /// Make a key good for nothing, for ever.
+    /// Revoke a key for ever.
     Revoke {
         /// The key's identifier.
         #[arg(value_parser = parse_key_id, value_name = "UUID")]
@@ -50,9 +51,9 @@ pub enum KeysCommand {
         /// The key's identifier.
         #[arg(value_parser = parse_key_id, value_name = "UUID")]
         id: KeyId,
-        /// Hours for which the secret so far stays good, up to 720 (30 days).
-        #[arg(long, value_parser = clap::value_parser!(u32).range(..=720), value_name = "N", default_value_t = 0)]
-        grace_hours: u32,
+        /// How long the old secret stays valid, at most 30d.
+        #[arg(long, alias = "grace-hours", value_parser = parse_grace, value_name = "DURATION", default_value = "0s")]
+        grace: Duration,
     },
 }
 
@@ -73,40 +74,48 @@ pub struct OrganisationsArgs {
     pub command: OrganisationsCommand,
 }
 
-/// What is done about organisations.
+/// Actions on organisations.
 #[derive(Debug, Clone, Subcommand)]
 pub enum OrganisationsCommand {
-    /// List all organisations with what they keep and may keep.
+    /// List all organisations with their usage and quotas.
     List,
-    /// Make an organisation, or find the one of that name.
+    /// Create an organisation, or find the one with that name.
     Create {
         /// The organisation's name.
         #[arg(value_parser = parse_name, value_name = "NAME")]
         name: String,
     },
-    /// Say what an organisation may keep; what is not given stays as it is.
+    /// Set the quotas of an organisation; a quota that is not given stays.
     Quota {
         /// The organisation's name.
         #[arg(value_name = "NAME")]
         name: String,
-        /// Bytes of files and models: a size such as 500G, `unlimited`, or `default` for what `--quota-bytes` says.
+        /// Bytes of files and models: a size such as 500G, `unlimited`, or `default` for that of `--quota-bytes`.
         #[arg(long, value_name = "SIZE", value_parser = parse_quota)]
         bytes: Option<Quota>,
-        /// Plants: a number, `unlimited`, or `default` for what `--quota-plants` says.
-        #[arg(long, value_name = "COUNT", value_parser = parse_quota)]
+        /// Plants: a number, `unlimited`, or `default` for that of `--quota-plants`.
+        #[arg(long, value_name = "COUNT", value_parser = parse_plant_quota)]
         plants: Option<Quota>,
     },
 }
 
-/// A quota of an organisation; `None` for what holds for all.
+/// A quota of an organisation; `None` for the default of all.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Quota(pub Option<u64>);
 
 fn parse_quota(text: &str) -> Result<Quota, String> {
+    quota_of(text, parse_size)
+}
+
+fn parse_plant_quota(text: &str) -> Result<Quota, String> {
+    quota_of(text, |text| text.parse().map_err(|_| "a whole number, `unlimited` or `default` is expected".to_owned()))
+}
+
+fn quota_of(text: &str, parse: impl Fn(&str) -> Result<u64, String>) -> Result<Quota, String> {
     match text {
         "default" => Ok(Quota(None)),
         "unlimited" => Ok(Quota(Some(UNLIMITED))),
-        text => parse_size(text).map(|size| Quota(Some(size))),
+        text => parse(text).map(|quota| Quota(Some(quota))),
     }
 }
 
@@ -120,5 +129,7 @@ mod tests {
         assert_eq!(parse_quota("unlimited"), Ok(Quota(Some(UNLIMITED))));
         assert_eq!(parse_quota("default"), Ok(Quota(None)));
         assert!(parse_quota("much").is_err());
+        assert_eq!(parse_plant_quota("20"), Ok(Quota(Some(20))));
+        assert!(parse_plant_quota("2K").is_err());
     }
 }

@@ -1,5 +1,5 @@
-//! The configuration file: what it says stands in for the defaults of the flags, so that flags and environment go before it
-//! and every command heeds it alike.
+//! The configuration file. Its values replace the defaults of the flags, so flags and environment variables take precedence
+//! in every command.
 
 use clap::builder::OsStr;
 use clap::error::{ContextKind, ContextValue};
@@ -15,6 +15,8 @@ pub const FLAG: &str = "config";
 pub const VARIABLE: &str = "HELIOMAP_CONFIG";
 /// Largest file, bytes.
 const MAX_BYTES: u64 = 1 << 20;
+/// Settings with the names that they had in version 0.1, which are still accepted: old, new.
+const RENAMED: [(&str, &str); 1] = [("max-megapixels", "max-image-megapixels")];
 
 /// Why a configuration file cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -23,13 +25,13 @@ pub enum ConfigError {
     Unreadable { path: PathBuf, source: std::io::Error },
     #[error("the configuration file {path} is larger than 1 MiB; give one with `flag: value` lines", path = path.display())]
     TooLarge { path: PathBuf },
-    #[error("the configuration file {path} is no YAML: {source}", path = path.display())]
+    #[error("the configuration file {path} is not YAML: {source}", path = path.display())]
     NoYaml { path: PathBuf, source: serde_yaml_ng::Error },
     #[error("the configuration file {path} must hold `flag: value` lines and nothing else", path = path.display())]
     NoMapping { path: PathBuf },
-    #[error("the configuration file {path} sets `{key}`, which is no setting{hint}", path = path.display())]
+    #[error("the configuration file {path} sets `{key}`, which is not a setting{hint}", path = path.display())]
     Unknown { path: PathBuf, key: String, hint: String },
-    #[error("the configuration file {path} sets `{key}` to what is neither a text, a number, true, false nor a list of these",
+    #[error("the configuration file {path} sets `{key}` to a value that is not text, a number, true, false or a list of these",
         path = path.display())]
     Value { path: PathBuf, key: String },
 }
@@ -53,10 +55,10 @@ pub fn is_setting(arg: &Arg) -> bool {
     arg.get_env().is_some() && arg.get_long().is_some_and(|flag| flag != FLAG)
 }
 
-/// A command whose flags have what a file says as their defaults.
+/// A command whose defaults are the values of a file.
 ///
 /// # Errors
-/// Where the file cannot be read or sets what is no setting of any command.
+/// When the file cannot be read or has a key that is not a setting of any command.
 pub fn with_file(command: Command, path: &Path) -> Result<Command, ConfigError> {
     let unreadable = |source| ConfigError::Unreadable { path: path.to_owned(), source };
     if std::fs::metadata(path).map_err(unreadable)?.len() > MAX_BYTES {
@@ -78,12 +80,13 @@ fn with_text(command: Command, text: &str, path: &Path) -> Result<Command, Confi
     let mut values: BTreeMap<String, Vec<&'static str>> = BTreeMap::new();
     for (key, value) in &mapping {
         let key = scalar(key).unwrap_or_default();
+        let key = RENAMED.iter().find(|(old, _)| *old == key).map_or(key, |(_, new)| (*new).to_owned());
         if !known.contains(&key) {
             let hint = nearest(&known, &key);
             return Err(ConfigError::Unknown { path: path.to_owned(), key, hint });
         }
         let texts = match value {
-            // As if it were not there.
+            // As if the key were absent.
             Value::Null => continue,
             Value::Sequence(items) => items.iter().map(scalar).collect(),
             value => scalar(value).map(|text| vec![text]),
@@ -93,6 +96,17 @@ fn with_text(command: Command, text: &str, path: &Path) -> Result<Command, Confi
         values.insert(key, texts.into_iter().map(|text| &*text.leak()).collect());
     }
     Ok(with_defaults(command, &values))
+}
+
+/// A command whose defaults are the values of environment variables with their names of version 0.1.
+pub fn with_renamed_variables(command: Command) -> Command {
+    let variable = |old: &str| format!("HELIOMAP_{}", old.replace('-', "_").to_uppercase());
+    let values = RENAMED.iter().filter_map(|(old, new)| {
+        let value = std::env::var(variable(old)).ok().filter(|value| !value.is_empty())?;
+        // The command line is read once in the life of a process.
+        Some(((*new).to_owned(), vec![&*value.leak()]))
+    });
+    with_defaults(command, &values.collect())
 }
 
 /// A value as one would write it behind a flag.
@@ -124,7 +138,7 @@ fn with_defaults(command: Command, values: &BTreeMap<String, Vec<&'static str>>)
         .mut_subcommands(|subcommand| with_defaults(subcommand, values))
 }
 
-/// The setting whose name is the most like a key, as part of a sentence; what clap would say of a flag.
+/// The setting whose name is most similar to a key, as part of a sentence; what clap suggests for a flag.
 fn nearest(known: &BTreeSet<String>, key: &str) -> String {
     let flags = known.iter().map(|name| {
         let name: &'static str = name.clone().leak();
@@ -159,32 +173,32 @@ mod tests {
     }
 
     #[test]
-    fn the_file_stands_in_for_defaults_and_flags_go_before_it() {
+    fn the_file_replaces_defaults_and_flags_take_precedence() {
         let text = "listen: b\nmax-size: 7\norigin: [x, y]\nopen: true\n";
         let read = |arguments: &[&str]| {
             let matches = with(text).unwrap().get_matches_from([&["t", "serve"], arguments].concat());
             matches.subcommand_matches("serve").unwrap().clone()
         };
-        let told = read(&[]);
-        assert_eq!(told.get_one::<String>("listen").unwrap(), "b");
-        assert_eq!(told.get_one::<u64>("max-size"), Some(&7));
-        assert_eq!(told.get_many::<String>("origin").unwrap().collect::<Vec<_>>(), ["x", "y"]);
-        assert!(told.get_flag("open"));
-        let told = read(&["--listen", "c", "--origin", "z"]);
-        assert_eq!(told.get_one::<String>("listen").unwrap(), "c");
-        assert_eq!(told.get_many::<String>("origin").unwrap().collect::<Vec<_>>(), ["z"]);
+        let matches = read(&[]);
+        assert_eq!(matches.get_one::<String>("listen").unwrap(), "b");
+        assert_eq!(matches.get_one::<u64>("max-size"), Some(&7));
+        assert_eq!(matches.get_many::<String>("origin").unwrap().collect::<Vec<_>>(), ["x", "y"]);
+        assert!(matches.get_flag("open"));
+        let matches = read(&["--listen", "c", "--origin", "z"]);
+        assert_eq!(matches.get_one::<String>("listen").unwrap(), "c");
+        assert_eq!(matches.get_many::<String>("origin").unwrap().collect::<Vec<_>>(), ["z"]);
         assert!(with("").is_ok() && with("listen:\n").is_ok());
     }
 
     #[test]
     fn mistakes_are_named() {
         let error = |text: &str| with(text).unwrap_err().to_string();
-        assert!(error("max-sise: 7").ends_with("sets `max-sise`, which is no setting; did you mean `max-size`?"));
-        assert!(error("once: 7").contains("`once`, which is no setting"));
+        assert!(error("max-sise: 7").ends_with("sets `max-sise`, which is not a setting; did you mean `max-size`?"));
+        assert!(error("once: 7").contains("`once`, which is not a setting"));
         assert!(error("zzzz: 7").ends_with("docs/CONFIGURATION.md lists them all"));
-        assert!(error("listen: {a: b}").contains("`listen` to what is neither"));
+        assert!(error("listen: {a: b}").contains("`listen` to a value that is not text"));
         assert!(error("- a").contains("`flag: value` lines"));
-        assert!(error("a: [").contains("no YAML"));
+        assert!(error("a: [").contains("not YAML"));
         let wrong = with("max-size: many").unwrap().try_get_matches_from(["t", "serve"]).unwrap_err().to_string();
         assert!(wrong.contains("many") && wrong.contains("--max-size"), "{wrong}");
     }

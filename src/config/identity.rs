@@ -1,4 +1,4 @@
-//! Whose tokens let in beside keys.
+//! The identity provider whose tokens are accepted beside keys.
 
 use crate::oidc::keys::Ages;
 use crate::oidc::{OidcSettings, OrganisationRule};
@@ -6,26 +6,26 @@ use crate::store::Scope;
 use clap::Args;
 use std::time::Duration;
 
-/// Whose tokens let in beside keys.
+/// The identity provider whose tokens are accepted beside keys.
 #[derive(Debug, Clone, Default, Args)]
 #[command(next_help_heading = "Identity provider")]
 pub struct OidcArgs {
-    /// An OpenID Connect provider whose tokens (RS256, ES256 or EdDSA) let in beside keys, by its `issuer`, to the letter.
+    /// The exact `issuer` of an OpenID Connect provider whose tokens (RS256, ES256 or EdDSA) are accepted beside keys.
     #[arg(long, env = "HELIOMAP_OIDC_ISSUER", value_name = "URL")]
     pub oidc_issuer: Option<String>,
-    /// What must stand in a token's `aud`.
+    /// The audience (`aud`) that a token must have.
     #[arg(long, env = "HELIOMAP_OIDC_AUDIENCE", value_name = "NAME")]
     pub oidc_audience: Option<String>,
-    /// The claim that names the caller's organisation; dots lead into claims within claims.
+    /// The claim that names the caller's organisation; dots select claims within claims.
     #[arg(long, env = "HELIOMAP_OIDC_ORGANISATION_CLAIM", default_value = "organisation", value_name = "CLAIM")]
     pub oidc_organisation_claim: String,
-    /// The organisation of all callers, whatever their tokens say.
+    /// The organisation of all callers, whatever their tokens contain.
     #[arg(long, env = "HELIOMAP_OIDC_ORGANISATION", value_name = "NAME")]
     pub oidc_organisation: Option<String>,
-    /// The claim that says what a caller may do: words with blanks between them, or a list.
+    /// The claim with the scopes of a caller: words separated by blanks, or a list.
     #[arg(long, env = "HELIOMAP_OIDC_SCOPE_CLAIM", default_value = "scope", value_name = "CLAIM")]
     pub oidc_scope_claim: String,
-    /// What a word of that claim stands for, `plant-admins=admin`; may be given more than once.
+    /// The scope that a word of that claim stands for, `plant-admins=admin`; may be repeated.
     #[arg(long, env = "HELIOMAP_OIDC_SCOPE", value_delimiter = ',', value_parser = parse_scope_word, value_name = "WORD=SCOPE",
         default_value = "heliomap:upload=upload,heliomap:read=read,heliomap:review=review,heliomap:admin=admin")]
     pub oidc_scope: Vec<(String, Scope)>,
@@ -38,11 +38,11 @@ impl OidcArgs {
     /// What tokens are checked by; `None` where no provider is named.
     ///
     /// # Errors
-    /// Where it is not said for whom its tokens must be.
+    /// When the audience is missing.
     pub fn settings(&self) -> Result<Option<OidcSettings>, &'static str> {
         let Some(issuer) = self.oidc_issuer.clone() else { return Ok(None) };
         let audience =
-            self.oidc_audience.clone().ok_or("--oidc-issuer needs --oidc-audience: what stands in a token's `aud`")?;
+            self.oidc_audience.clone().ok_or("--oidc-issuer needs --oidc-audience: the `aud` of its tokens")?;
         let organisation = match &self.oidc_organisation {
             Some(name) => OrganisationRule::Named(name.clone()),
             None => OrganisationRule::Claim(self.oidc_organisation_claim.clone()),

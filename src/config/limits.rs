@@ -1,11 +1,11 @@
-//! How much one client, and one organisation, may ask for.
+//! What one client, and one organisation, may use.
 
-use super::parse_seconds;
+use super::units::{parse_megapixels, parse_seconds, parse_size};
 use crate::store::Quotas;
 use clap::Args;
 use std::time::Duration;
 
-/// How much one client may ask for. Sizes take the endings K, M, G and T (powers of 1024).
+/// What one client may use. In sizes, K, M, G and T are powers of 1024.
 #[derive(Debug, Clone, Args)]
 #[command(next_help_heading = "Limits")]
 pub struct Limits {
@@ -13,7 +13,7 @@ pub struct Limits {
     #[arg(long, env = "HELIOMAP_MAX_IMAGE_SIZE", default_value = "256M", value_parser = parse_size, value_name = "SIZE")]
     pub max_image_size: u64,
     /// Largest image, in millions of pixels; checked before an image is decoded.
-    #[arg(long, env = "HELIOMAP_MAX_IMAGE_MEGAPIXELS", default_value_t = 100.0, value_name = "MP")]
+    #[arg(long, env = "HELIOMAP_MAX_IMAGE_MEGAPIXELS", default_value = "100", value_parser = parse_megapixels, value_name = "MP")]
     pub max_image_megapixels: f64,
     /// Largest single file of a reconstruction.
     #[arg(long, env = "HELIOMAP_MAX_FILE_SIZE", default_value = "8G", value_parser = parse_size, value_name = "SIZE")]
@@ -30,23 +30,23 @@ pub struct Limits {
     /// Most entries in a zip or tar, and most images in one multipart upload.
     #[arg(long, env = "HELIOMAP_MAX_ENTRIES", default_value_t = 20_000, value_name = "COUNT")]
     pub max_entries: usize,
-    /// How often a job is started without getting anywhere before it fails.
+    /// How many attempts in a row may make no progress before a job fails.
     #[arg(long, env = "HELIOMAP_MAX_ATTEMPTS", default_value_t = 3, value_name = "COUNT")]
     pub max_attempts: u32,
-    /// How long an upload may stand still, and any other request may take, in seconds.
-    #[arg(long, env = "HELIOMAP_REQUEST_TIMEOUT", default_value = "30", value_parser = parse_seconds, value_name = "SECONDS")]
+    /// How long an upload may stall, and how long any other request may take.
+    #[arg(long, env = "HELIOMAP_REQUEST_TIMEOUT", default_value = "30s", value_parser = parse_seconds, value_name = "DURATION")]
     pub request_timeout: Duration,
-    /// Requests per second of one key, on average; for a moment twice as many.
+    /// Requests per second of one key, on average; bursts may be twice as many.
     #[arg(long, env = "HELIOMAP_MAX_REQUESTS_PER_SECOND", default_value_t = 300, value_parser = clap::value_parser!(u32).range(1..), value_name = "COUNT")]
     pub max_requests_per_second: u32,
-    /// Requests per minute without a good key from one address before it is told to wait.
+    /// Requests per minute without a valid key that one address may send.
     #[arg(long, env = "HELIOMAP_MAX_FAILED_LOGINS_PER_MINUTE", default_value_t = 300, value_parser = clap::value_parser!(u32).range(1..), value_name = "COUNT")]
     pub max_failed_logins_per_minute: u32,
     /// Most connections at once; more wait.
     #[arg(long, env = "HELIOMAP_MAX_CONNECTIONS", default_value_t = 1024, value_name = "COUNT")]
     pub max_connections: usize,
-    /// Most connections from one address at once (from one /64 with IPv6); more are closed. Of no effect with
-    /// `--behind-proxy`, where all come from the proxy.
+    /// Most connections from one address at once (from one /64 with IPv6); more are closed. Ignored with
+    /// `--behind-proxy`, where all connections come from the proxy.
     #[arg(long, env = "HELIOMAP_MAX_CONNECTIONS_PER_ADDRESS", default_value_t = 256, value_name = "COUNT")]
     pub max_connections_per_address: usize,
     /// Most unfinished resumable uploads of an organisation.
@@ -55,18 +55,18 @@ pub struct Limits {
     /// Free space of the data folder's disk that uploads leave to running jobs.
     #[arg(long, env = "HELIOMAP_DISK_RESERVE", default_value = "1G", value_parser = parse_size, value_name = "SIZE")]
     pub disk_reserve: u64,
-    /// Most bytes of files and models that an organisation may keep, unless `heliomap organisations quota` says otherwise of
-    /// it; no bound where it is not given.
+    /// Most bytes of files and models that an organisation may keep; unlimited if absent. `heliomap organisations quota` sets
+    /// it for one organisation.
     #[arg(long, env = "HELIOMAP_QUOTA_BYTES", value_parser = parse_size, value_name = "SIZE")]
     pub quota_bytes: Option<u64>,
-    /// Most plants that an organisation may have, unless `heliomap organisations quota` says otherwise of it; no bound where it
-    /// is not given.
+    /// Most plants that an organisation may have; unlimited if absent. `heliomap organisations quota` sets it for one
+    /// organisation.
     #[arg(long, env = "HELIOMAP_QUOTA_PLANTS", value_name = "COUNT")]
     pub quota_plants: Option<u64>,
 }
 
 impl Limits {
-    /// What every organisation may keep of which nothing else was said.
+    /// The quotas of organisations without quotas of their own.
     pub fn quotas(&self) -> Quotas {
         Quotas { bytes: self.quota_bytes, plants: self.quota_plants }
     }
@@ -93,35 +93,5 @@ impl Default for Limits {
             quota_bytes: None,
             quota_plants: None,
         }
-    }
-}
-
-/// Reads a number of bytes with one of the endings K, M, G and T.
-pub(super) fn parse_size(text: &str) -> Result<u64, String> {
-    let digits = text.trim_end_matches(|c: char| !c.is_ascii_digit());
-    let shift = match text[digits.len()..].trim().to_ascii_uppercase().trim_end_matches("IB").trim_end_matches('B') {
-        "" => 0,
-        "K" => 10,
-        "M" => 20,
-        "G" => 30,
-        "T" => 40,
-        _ => return Err("a size is a whole number with K, M, G or T behind it, such as 256M".to_owned()),
-    };
-    let number: u64 = digits.parse().map_err(|_| "a size begins with a whole number, such as 256M".to_owned())?;
-    number.checked_mul(1 << shift).ok_or_else(|| "the size is too large".to_owned())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn sizes() {
-        assert_eq!(parse_size("256M"), Ok(256 << 20));
-        assert_eq!(parse_size("8 GiB"), Ok(8 << 30));
-        assert_eq!(parse_size("17"), Ok(17));
-        assert!(parse_size("M").is_err());
-        assert!(parse_size("12X").is_err());
-        assert!(parse_size("99999999999T").is_err());
     }
 }

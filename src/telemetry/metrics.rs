@@ -1,4 +1,4 @@
-//! What the service counts, in Prometheus' form.
+//! Metrics of the service, in Prometheus' format.
 
 use crate::store::{Blobs, Store};
 use axum::Router;
@@ -59,19 +59,19 @@ struct PoolLabels {
 
 type Seconds = Gauge<f64, AtomicU64>;
 
-/// What this process counts; a clone counts the same.
+/// The metrics of this process; clones share them.
 #[derive(Debug, Clone)]
 pub struct Metrics {
     pub requests: Family<RequestLabels, Counter>,
     pub request_seconds: Family<RequestLabels, Histogram, fn() -> Histogram>,
     pub requests_in_flight: Gauge,
     pub upload_bytes: Counter,
-    /// Attempts at jobs, by how they ended.
+    /// Attempts at jobs, by outcome.
     pub attempts: Family<OutcomeLabels, Counter>,
     /// Images of other workers' jobs that this one searched.
     pub images_helped: Counter,
     pub stage_seconds: Family<StageLabels, Histogram, fn() -> Histogram>,
-    /// Messages to webhooks, by what became of them.
+    /// Messages to webhooks, by outcome.
     pub deliveries: Family<OutcomeLabels, Counter>,
     jobs: Family<StateLabels, Gauge>,
     queue_depth: Gauge,
@@ -107,36 +107,36 @@ impl Default for Metrics {
         registry.register("requests", "Requests answered", metrics.requests.clone());
         registry.register_with_unit(
             "request",
-            "Time from a request's head to its answer's",
+            "Time from the head of a request to the head of its response",
             Unit::Seconds,
             metrics.request_seconds.clone(),
         );
         registry.register("requests_in_flight", "Requests being answered", metrics.requests_in_flight.clone());
-        registry.register_with_unit("upload", "Bytes of uploads that came", Unit::Bytes, metrics.upload_bytes.clone());
+        registry.register_with_unit("upload", "Bytes of uploads received", Unit::Bytes, metrics.upload_bytes.clone());
         registry.register(
             "images_helped",
-            "Images of other workers' jobs that were searched here",
+            "Images of other workers' jobs that this process searched",
             metrics.images_helped.clone(),
         );
-        registry.register("job_attempts", "Attempts at jobs by how they ended", metrics.attempts.clone());
+        registry.register("job_attempts", "Attempts at jobs by outcome", metrics.attempts.clone());
         registry.register_with_unit(
             "stage",
-            "Time of each stage of the mappings that went through in one go",
+            "Time of each stage of mappings that were not resumed",
             Unit::Seconds,
             metrics.stage_seconds.clone(),
         );
         let deliveries = metrics.deliveries.clone();
-        registry.register("webhook_deliveries", "Messages sent to webhooks by what became of them", deliveries);
-        registry.register("jobs", "Jobs by state, whoever's and whichever process's", metrics.jobs.clone());
-        registry.register("queue_depth", "Jobs that wait for a worker", metrics.queue_depth.clone());
+        registry.register("webhook_deliveries", "Messages sent to webhooks by outcome", deliveries);
+        registry.register("jobs", "Jobs by state, of all organisations and processes", metrics.jobs.clone());
+        registry.register("queue_depth", "Queued jobs", metrics.queue_depth.clone());
         registry.register(
             "images_waiting",
-            "Images of running jobs that wait for a worker to help",
+            "Images of running jobs that wait for a worker",
             metrics.images_waiting.clone(),
         );
         registry.register_with_unit(
             "queue_age",
-            "How long the oldest job that waits has been waiting",
+            "Waiting time of the oldest queued job",
             Unit::Seconds,
             metrics.queue_age_seconds.clone(),
         );
@@ -199,8 +199,8 @@ pub struct Scrape {
     pub blobs: Blobs,
 }
 
-/// `GET /metrics`, for a listener of its own, since it tells of all organisations; and `GET /health`, which answers there
-/// however many connections the clients hold.
+/// `GET /metrics` on a separate listener, because it covers all organisations, and `GET /health`, which answers there
+/// however many connections clients hold.
 pub fn router(scrape: Scrape) -> Router {
     Router::new()
         .route("/metrics", get(serve))
@@ -212,7 +212,7 @@ async fn serve(State(scrape): State<Scrape>) -> Response {
     match scrape.metrics.render(&*scrape.store, &scrape.blobs).await {
         Ok(text) => ([(header::CONTENT_TYPE, OPENMETRICS)], text).into_response(),
         Err(error) => {
-            tracing::error!(%error, "the metrics cannot be told");
+            tracing::error!(%error, "cannot collect the metrics");
             StatusCode::SERVICE_UNAVAILABLE.into_response()
         }
     }

@@ -1,4 +1,4 @@
-//! What the service tells of itself: structured events to standard error, metrics, and traces.
+//! Structured events to standard error, metrics, and traces.
 
 pub mod metrics;
 pub mod traces;
@@ -14,7 +14,7 @@ use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{EnvFilter, Layer, fmt};
 
-/// Why nothing can be told.
+/// Why telemetry cannot start.
 #[derive(Debug, thiserror::Error)]
 pub enum TelemetryError {
     #[error("--log: {0}")]
@@ -23,17 +23,17 @@ pub enum TelemetryError {
     Exporter(#[from] ExporterBuildError),
 }
 
-/// Starts logging and, where that is asked for, tracing. Call once; what is returned sends the last traces.
+/// Starts logging and, if configured, tracing. Call once; the returned value sends the last traces.
 pub fn init(log: &LogArgs, traces: &TraceArgs) -> Result<Option<Traces>, TelemetryError> {
     let filter = EnvFilter::try_new(&log.log)?;
-    let told = fmt::layer().with_writer(std::io::stderr);
-    let told = match log.log_format {
-        LogFormat::Pretty => told.boxed(),
-        LogFormat::Json => told.json().flatten_event(true).boxed(),
+    let logs = fmt::layer().with_writer(std::io::stderr);
+    let logs = match log.log_format {
+        LogFormat::Pretty => logs.boxed(),
+        LogFormat::Json => logs.json().flatten_event(true).boxed(),
     };
-    // What is traced does not depend on what is logged: this program's spans, and none of its libraries'.
+    // Traces do not depend on the log filter: they hold the spans of this program, not those of libraries.
     let (layer, traces) = traces::layer(traces)?.unzip();
     let layer = layer.map(|layer| layer.with_filter(Targets::new().with_target("heliomap", LevelFilter::INFO)));
-    tracing_subscriber::registry().with(told.with_filter(filter)).with(layer).init();
+    tracing_subscriber::registry().with(logs.with_filter(filter)).with(layer).init();
     Ok(traces)
 }

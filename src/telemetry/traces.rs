@@ -1,4 +1,4 @@
-//! Traces to an OpenTelemetry collector, where one is named: requests, jobs and their stages.
+//! Traces of requests, jobs and their stages for an OpenTelemetry collector, if one is configured.
 
 use crate::config::TraceArgs;
 use axum::http::HeaderMap;
@@ -14,7 +14,7 @@ use tracing::{Span, Subscriber};
 use tracing_opentelemetry::{OpenTelemetryLayer, OpenTelemetrySpanExt};
 use tracing_subscriber::registry::LookupSpan;
 
-/// The variables by which all programs are told of a collector.
+/// The standard variables that name a collector.
 const VARIABLES: [&str; 2] = ["OTEL_EXPORTER_OTLP_TRACES_ENDPOINT", "OTEL_EXPORTER_OTLP_ENDPOINT"];
 /// Where a collector takes traces.
 const PATH: &str = "/v1/traces";
@@ -35,11 +35,11 @@ impl Traces {
     }
 }
 
-/// What turns spans into traces, and what sends them; `None` where no collector is named.
+/// The layer that turns spans into traces, and their sender; `None` without a collector.
 ///
 /// # Errors
-/// Where the collector's address cannot be used.
-#[expect(clippy::type_complexity, reason = "the layer of a subscriber says which subscriber it is of")]
+/// When the collector's address cannot be used.
+#[expect(clippy::type_complexity, reason = "the type of a layer names its subscriber")]
 pub fn layer<S: Subscriber + for<'span> LookupSpan<'span>>(
     args: &TraceArgs,
 ) -> Result<Option<(OpenTelemetryLayer<S, SdkTracer>, Traces)>, ExporterBuildError> {
@@ -70,7 +70,7 @@ pub fn are_on() -> bool {
     ON.load(Ordering::Relaxed)
 }
 
-/// Makes a span part of the trace that a client began (W3C Trace Context), where it says so.
+/// Makes a span part of the client's trace (W3C Trace Context), if the request has one.
 pub fn join(span: &Span, headers: &HeaderMap) {
     if headers.contains_key("traceparent") {
         let context: Context = TraceContextPropagator::new().extract(&Headers(headers));

@@ -196,7 +196,7 @@ fn options_out_of_range() {
     survey.is_refused(&["--max-gsd", "5"], &["max_gsd_m_per_px must be 0.001 to 1", "correct it"]);
     survey.is_refused(&["--max-gsd", "NaN"], &["max_gsd_m_per_px", "correct it"]);
     survey.is_refused(&["--spacing", "1.0,50"], &["spacing_m", "0.1 to 10 metres"]);
-    survey.is_refused(&["--spacing", "1.0"], &["--spacing takes two lengths"]);
+    survey.is_refused(&["--spacing", "1.0"], &["--spacing", "two lengths in metres"]);
     survey.is_refused(&["--refinement", "best"], &["--refinement", "lattice"]);
     survey.is_refused(&["--detector"], &["--detector"]);
 }

@@ -141,7 +141,7 @@ fn what_is_restored_answers_the_same() {
     assert!(program.terminate().success());
 
     let (ok, said) = run(&["restore", text(&backup), "--data-dir", text(&back)]);
-    assert!(ok && said.contains("are back"), "{said}");
+    assert!(ok && said.contains("restored "), "{said}");
     let (ok, said) = run(&["verify", "--content", "--data-dir", text(&back)]);
     assert!(ok && said.contains("blobs are there"), "{said}");
     let (_program, base) = serve(&back, &["--no-worker"]);
@@ -193,7 +193,7 @@ fn a_backup_that_is_not_whole_is_not_restored() {
     refused("the backup lacks");
     std::fs::write(&blob, &bytes).unwrap();
     std::fs::rename(backup.join("backup.json"), backup.join("later")).unwrap();
-    refused("is no whole backup");
+    refused("is not a complete backup");
     std::fs::rename(backup.join("later"), backup.join("backup.json")).unwrap();
     let (ok, said) = run(&["restore", text(&backup), "--data-dir", text(&back)]);
     assert!(ok, "{said}");

@@ -38,8 +38,9 @@ async fn postgres_store() -> PostgresStore {
 
 /// The URL of a new database of that server.
 async fn postgres_database() -> String {
-    let server = std::env::var("HELIOMAP_TEST_POSTGRES")
-        .expect("HELIOMAP_TEST_POSTGRES must name a server: run `make unit`, or tests/with-postgres.sh before cargo test");
+    let server = std::env::var("HELIOMAP_TEST_POSTGRES").expect(
+        "HELIOMAP_TEST_POSTGRES must name a server: run `make unit`, or tests/with-postgres.sh before cargo test",
+    );
     let name = format!("test_{}", uuid::Uuid::new_v4().simple());
     let pool = sqlx::PgPool::connect(&format!("{server}/postgres")).await.unwrap();
     sqlx::query(sqlx::AssertSqlSafe(format!("CREATE DATABASE {name}"))).execute(&pool).await.unwrap();

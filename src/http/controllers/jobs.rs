@@ -1,5 +1,6 @@
 //! Jobs.
 
+use crate::config::StartJob;
 use crate::http::controllers::surveys::missing_views;
 use crate::http::error::{ApiError, Code, Problem};
 use crate::http::extract::{ApiPath, ApiQuery, Object};
@@ -12,75 +13,9 @@ use axum::extract::State;
 use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use heliomap_mapping::pipeline::{MapOptions, Stage};
-use heliomap_mapping::refinement::Control;
 use heliomap_model::{BenchId, PlantId, Warning};
 use jiff::Timestamp;
-use serde::{Deserialize, Serialize};
-
-/// What a mapping may be told; every member may be left out.
-#[derive(Debug, Default, Deserialize, utoipa::ToSchema)]
-#[serde(default, deny_unknown_fields)]
-pub struct StartJob {
-    /// Rows of modules per bench; inferred where it is not given.
-    #[schema(minimum = 1, maximum = 64)]
-    pub rows_per_bench: Option<u32>,
-    /// Ground sampling distance in metres per pixel above which an image does not resolve modules and is left out of
-    /// detection; chosen from the images where it is not given.
-    #[schema(exclusive_minimum = 0.0)]
-    pub max_gsd_m_per_px: Option<f64>,
-    /// Known spacing of module centres along and across the row, metres.
-    #[schema(value_type = Option<Vec<f64>>, min_items = 2, max_items = 2)]
-    pub spacing_m: Option<[f64; 2]>,
-    /// Known size of a module's face, width along the row and height across it, metres; in place of `spacing_m`.
-    #[schema(value_type = Option<Vec<f64>>, min_items = 2, max_items = 2)]
-    pub module_size_m: Option<[f64; 2]>,
-    /// Places that are known, to align the model by: `points` marked in images (`name`, `wgs84` or `enu_m`,
-    /// `observations` of `image` and `pixel`) and `modules` (`label`, `wgs84` or `enu_m`).
-    #[schema(value_type = Option<Object>)]
-    pub control: Option<Control>,
-    /// Whether known places set the scale too; where it is not given, they do unless a spacing or module size does.
-    pub control_scale: Option<bool>,
-    /// What heights refer to, stated in the model.
-    #[schema(max_length = 200)]
-    pub vertical_datum: Option<String>,
-    /// Seed of every random choice, 1 where it is not given.
-    pub seed: Option<u64>,
-    /// Among waiting jobs the highest is taken first; 0 where it is not given.
-    #[schema(minimum = -100, maximum = 100)]
-    pub priority: Option<i32>,
-}
-
-impl StartJob {
-    fn into_options(self) -> Result<MapOptions, ApiError> {
-        let refuse = |what: &'static str| Err(ApiError::new(Code::InvalidFields, what));
-        let positive = |value: &f64| value.is_finite() && *value > 0.0;
-        if self.rows_per_bench.is_some_and(|rows| !(1..=64).contains(&rows)) {
-            return refuse("rows_per_bench must be 1 to 64; leave it out to have it inferred");
-        }
-        if self.max_gsd_m_per_px.as_ref().is_some_and(|gsd| !positive(gsd)) {
-            return refuse("max_gsd_m_per_px must be positive; leave it out to have it chosen from the images");
-        }
-        if self.priority.is_some_and(|priority| !(-100..=100).contains(&priority)) {
-            return refuse("priority must be -100 to 100; leave it out for 0");
-        }
-        if self.spacing_m.as_ref().is_some_and(|spacing| !spacing.iter().all(positive)) {
-            return refuse("spacing_m must be two positive numbers of metres; leave it out where it is not known");
-        }
-        let options = MapOptions {
-            rows_per_bench: self.rows_per_bench,
-            max_gsd_m_per_px: self.max_gsd_m_per_px,
-            spacing_m: self.spacing_m,
-            module_size_m: self.module_size_m,
-            control: self.control,
-            control_scale: self.control_scale,
-            vertical_datum: self.vertical_datum,
-            seed: self.seed.unwrap_or(MapOptions::default().seed),
-            ..MapOptions::default()
-        };
-        options.check().map_err(|error| ApiError::new(Code::InvalidFields, error.to_string()))?;
-        Ok(options)
-    }
-}
+use serde::Serialize;
 
 /// One mapping of a survey.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
@@ -276,7 +211,7 @@ pub async fn start(
         asked.map_or_else(StartJob::default, |Object(asked)| asked)
     };
     let priority = asked.priority.unwrap_or(0);
-    let options = asked.into_options()?;
+    let options = asked.into_options().map_err(|what| ApiError::new(Code::InvalidFields, what))?;
     state.require_survey(plant, survey).await?;
     let missing = missing_views(&state.store.files(survey).await?);
     if !missing.is_empty() {
