@@ -1,4 +1,4 @@
-# The same steps as `make setup` and `cargo build`, in an image that holds only what the program needs to run.
+# The steps of `make setup` and `cargo build`; the final image holds only what the program needs.
 
 FROM node:20-bookworm AS web
 WORKDIR /heliomap
@@ -21,7 +21,7 @@ COPY --from=web /heliomap/web/dist/ web/dist/
 RUN cargo build --release --locked --bin heliomap
 
 FROM debian:bookworm-slim
-# The authorities by which object stores, identity providers and receivers of webhooks are known.
+# Certificates of public authorities, for object stores, identity providers and receivers of webhooks.
 RUN apt-get update \
     && apt-get install --yes --no-install-recommends ca-certificates \
     && rm -rf /var/lib/apt/lists/*

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Checks the deployment files: the Dockerfile by hadolint, compose.yaml against the Compose specification, the Helm chart by
-Helm's own lint and, rendered with several sets of values, against Kubernetes' schemas. What is not Kubernetes' own, such as
-KEDA's ScaledObject, is checked for its kind alone. Nothing is run: that takes a container engine and a cluster.
+Helm's own lint and, rendered with several sets of values, against Kubernetes' schemas. Other kinds, such as
+KEDA's ScaledObject, are checked for their kind only. Nothing is run: that takes a container engine and a cluster.
 """
 
 import re
@@ -18,7 +18,7 @@ ROOT = HERE.parent
 CHART = HERE / "helm" / "heliomap"
 BIN = Path(sys.executable).parent
 KUBERNETES = ("1.30", "1.37")
-#: Sets of values that between them take every branch of the templates.
+#: Sets of values that together take every branch of the templates.
 VALUES = {
     "as it is": {},
     "everything on": {
@@ -46,7 +46,7 @@ VALUES = {
     "roles in place of keys": {"blobs": {"existingSecret": ""}, "metrics": {"scrapeAnnotations": False}},
     "a Prometheus with labels of its own": {"autoscaling": {"enabled": True, "matchers": 'app="demo"'}},
     "a gateway in front": {"server": {"behindProxy": True}},
-    "an ingress that hides nobody": {"ingress": {"enabled": True}, "server": {"behindProxy": False}},
+    "an ingress that keeps addresses": {"ingress": {"enabled": True}, "server": {"behindProxy": False}},
     "a proxy by the environment": {"env": {"HELIOMAP_BEHIND_PROXY": "true"}},
 }
 #: Those in which servers take clients' addresses from a proxy.

@@ -130,7 +130,7 @@ def upload(api: Api) -> str:
     plant = api.post("/plants", {"name": "Example plant"})["id"]
     survey = f"/plants/{plant}/surveys/" + api.post(f"/plants/{plant}/surveys", {"name": "First flight"})["id"]
     photos = sorted((EXAMPLE / "images").iterdir())
-    # One photo by itself, as a link that comes and goes would send it; the others in forms of three.
+    # One photo by itself, as an unreliable link would send it; the others in forms of three.
     api.put_file(f"{survey}/images/{photos[0].name}", photos[0])
     bar("photos", 1, len(photos))
     for at in range(1, len(photos), 3):
@@ -189,7 +189,7 @@ def main() -> None:
             raise SystemExit(f"the job {job['state']}: {(job.get('error') or {}).get('message')}")
         print(f"mapped in {time.monotonic() - start:.1f} s", flush=True)
         for warning in job.get("warnings", []):
-            print(f"  note ({warning['code']}): {warning['message']}")
+            print(f"  warning ({warning['code']}): {warning['message']}")
         for layer in ("modules", "sectors", "benches", "lines"):
             collection = api.call("GET", f"/plants/{plant}/models/latest/{layer}")
             (OUT / f"{layer}.geojson").write_text(json.dumps(collection))

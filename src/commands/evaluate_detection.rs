@@ -91,7 +91,7 @@ pub fn run(args: &EvaluateDetectionArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The boxes of a file; those that cannot be used are told.
+/// The boxes of a file; unusable ones are logged and left out.
 fn given_boxes(path: &Path) -> anyhow::Result<Vec<ImageDetections>> {
     let read = external::read(path)?;
     for (image, count) in &read.left_out {

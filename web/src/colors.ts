@@ -1,4 +1,4 @@
-// What the colours of modules mean. All are told apart with the common kinds of colour blindness.
+// The meaning of the colours of modules. They differ with the common kinds of colour blindness.
 
 import type { ExpressionSpecification } from "maplibre-gl";
 import type { Feature, ModuleProperties } from "./api";

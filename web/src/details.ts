@@ -1,4 +1,4 @@
-// Everything that is known about one module.
+// Details of one module.
 
 import type { Feature, ModuleProperties } from "./api";
 import { h, plural } from "./dom";

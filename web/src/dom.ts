@@ -1,4 +1,4 @@
-// The little of a framework that this page needs.
+// Small helpers for the DOM.
 
 type Child = Node | string | undefined;
 

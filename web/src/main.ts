@@ -14,7 +14,7 @@ import { type ColorBy, legend } from "./colors";
 import { moduleDetails } from "./details";
 import { byId, h, moment, plural } from "./dom";
 import { PlantMap } from "./map";
-import { Surveys, told } from "./surveys";
+import { errorText, Surveys } from "./surveys";
 import "./style.css";
 
 const MAX_RESULTS = 30;
@@ -39,7 +39,7 @@ const map = openMap();
 const surveys = new Surveys(
   byId("surveys"),
   (plant, version) => {
-    // Identifiers outlive models: the module that is looked at stays in sight.
+    // Identifiers outlive models: the selected module stays selected.
     if (plant === plants.value) void attempt(() => openPlant(plant, version, shown.selected));
   },
   (photos) => void map?.showPhotos(photos),
@@ -53,7 +53,7 @@ function openMap(): PlantMap | undefined {
       h(
         "p",
         {},
-        `The map needs WebGL, which this browser does not offer (${error}). Search and details work without it.`,
+        `The map needs WebGL, which this browser does not offer (${error}). Search and details work without the map.`,
       ),
     );
     return undefined;
@@ -73,7 +73,7 @@ async function attempt(action: () => Promise<void>): Promise<void> {
     } else {
       const retry = h("button", { type: "button", click: () => void attempt(action) }, "Try again");
       const code = error instanceof Problem ? h("code", {}, error.code) : undefined;
-      place.replaceChildren(h("span", {}, told(error)), ...(code ? [code] : []), retry);
+      place.replaceChildren(h("span", {}, errorText(error)), ...(code ? [code] : []), retry);
     }
     place.hidden = false;
     status.textContent = "";
@@ -97,9 +97,9 @@ function askForKey(then: () => void): HTMLFormElement {
   return h(
     "form",
     { submit: go },
-    h("span", {}, "This service asks for a key that may read. "),
+    h("span", {}, "This service requires a key with the scope read. "),
     key,
-    h("button", {}, "Go on"),
+    h("button", {}, "Continue"),
   );
 }
 
@@ -134,7 +134,7 @@ async function openPlant(plant: string, version?: number, module?: string): Prom
   loading = new AbortController();
   const { signal } = loading;
   if (plant !== shown.plant) {
-    // Nothing of the last plant may stand under the name of this one.
+    // Nothing of the previous plant may be shown under the name of this one.
     models.replaceChildren();
     await present(undefined, [], [], []);
     shown.plant = plant;

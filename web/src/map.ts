@@ -1,4 +1,4 @@
-// The plant from above: modules, outlines of benches and lines, their labels. Nothing is fetched from elsewhere.
+// The plant from above: modules, outlines of benches and lines, labels. Nothing is fetched from other hosts.
 
 import {
   type GeoJSONSource,
@@ -108,7 +108,7 @@ export class PlantMap {
             source: "photos",
             paint: {
               "circle-radius": ["interpolate", ["linear"], ["zoom"], 14, 3, 20, 7],
-              // Red: something is wrong with it. White: the reconstruction leaves it out.
+              // Red: the photo has a warning. White: the reconstruction does not use it.
               "circle-color": ["case", ["get", "warned"], "#d1495b", ["get", "left"], "#ffffff", INK],
               "circle-stroke-color": INK,
               "circle-stroke-width": 1.5,
@@ -171,7 +171,7 @@ export class PlantMap {
     this.map.addControl(new NavigationControl({ visualizePitch: false }), "top-right");
     this.map.addControl(new ScaleControl({ maxWidth: 160 }), "bottom-left");
     this.ready = new Promise((resolve) => this.map.once("load", resolve));
-    // For tests: whether all is drawn.
+    // For tests: whether everything is drawn.
     this.map.on("render", () => (container.dataset.drawn = "partly"));
     this.map.on("idle", () => (container.dataset.drawn = "all"));
     this.map.on("mousemove", (event) => this.hover(this.moduleAt(event.point)));
@@ -205,7 +205,7 @@ export class PlantMap {
     const bounds = new LngLatBounds();
     const modules = layers.modules.map(({ id, geometry, properties: p }) => {
       for (const position of geometry?.coordinates[0] ?? []) bounds.extend([position[0], position[1]]);
-      // The worker needs no more than what it draws.
+      // The worker gets only the properties that it draws.
       const properties = {
         id,
         benchIndex: benchIndex.get(p.bench) ?? 0,

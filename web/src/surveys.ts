@@ -1,4 +1,4 @@
-// Surveys of a plant and how far their mappings are.
+// Surveys of a plant, with the progress of their mappings.
 
 import {
   cancelJob,
@@ -61,7 +61,7 @@ export class Surveys {
   private entry(survey: Survey, signal: AbortSignal): HTMLElement {
     const job = h("div", { class: "job" });
     const files = h("div", {});
-    // One survey at a time is looked at: its photos are those on the map.
+    // One survey is open at a time: its photos are shown on the map.
     const details = h("details", { name: "survey-photos" }, h("summary", {}, "Photos and files"), files);
     details.addEventListener("toggle", () => {
       if (details.open) void this.describe(survey, files, () => details.open && !signal.aborted);
@@ -88,10 +88,10 @@ export class Surveys {
         seenUnfinished = true;
         pause = POLL_MS;
       } catch (error) {
-        // The service may be away for a moment; what was last known stays.
+        // The service may be unreachable for a moment; the last known state stays.
         pause = Math.min(SLOWEST_POLL_MS, pause * 2);
         place.querySelector(".trouble")?.remove();
-        place.append(h("p", { class: "trouble" }, `${told(error)} Asking again in ${Math.round(pause / 1000)} s.`));
+        place.append(h("p", { class: "trouble" }, `${errorText(error)} Retrying in ${Math.round(pause / 1000)} s.`));
       }
       await new Promise((resolve) => setTimeout(resolve, pause));
     }
@@ -128,7 +128,7 @@ export class Surveys {
       );
       this.located(positions);
     } catch (error) {
-      place.replaceChildren(h("p", { class: "trouble" }, told(error)));
+      place.replaceChildren(h("p", { class: "trouble" }, errorText(error)));
     }
   }
 
@@ -144,7 +144,7 @@ export class Surveys {
             action().then(again, (error: unknown) => {
               button.disabled = false;
               place.querySelector(".trouble")?.remove();
-              place.append(h("p", { class: "trouble", role: "alert" }, told(error)));
+              place.append(h("p", { class: "trouble", role: "alert" }, errorText(error)));
             });
           },
         },
@@ -185,7 +185,7 @@ export class Surveys {
     const failed = job.state === "failed";
     place.replaceChildren(
       h("p", { class: failed ? "trouble" : "quiet" }, `${failed ? "Failed" : "Cancelled"} on ${when}.`),
-      ...(failed ? [h("p", {}, job.error?.message ?? "No reason was given.")] : []),
+      ...(failed ? [h("p", {}, job.error?.message ?? "No reason given.")] : []),
       act("Map it again", () => startJob(survey)),
     );
   }
@@ -205,6 +205,6 @@ function standing(job: Job): { text: string; share?: number } {
   };
 }
 
-export function told(error: unknown): string {
+export function errorText(error: unknown): string {
   return error instanceof Problem ? `${error.title}. ${error.detail}` : String(error);
 }

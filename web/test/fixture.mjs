@@ -1,5 +1,5 @@
-// A service made of thin air, so that the page can be looked at alone: `npm run build && npm run fixture`.
-// It answers as /openapi.yaml says, with made-up plants, one mapping that runs, one that failed, and none at all.
+// A fake service for trying the page without a real one: `npm run build && npm run fixture`.
+// Its responses follow /openapi.yaml: made-up plants, a running mapping, a failed one, and a survey without any.
 
 import { createHash } from "node:crypto";
 import { readFile } from "node:fs/promises";

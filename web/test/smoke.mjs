@@ -1,5 +1,5 @@
 // Opens the built page in Chromium and uses it. CHROMIUM names the browser, SHOTS a folder for screenshots, and PAGE a
-// running service to look at in place of the made-up one (it must hold a mapped plant).
+// running service with a mapped plant to use instead of the fake one.
 
 import assert from "node:assert/strict";
 import { mkdir } from "node:fs/promises";
@@ -18,10 +18,10 @@ const browser = await chromium.launch({
 
 try {
   const page = await browser.newPage({ viewport: { width: 1280, height: 800 } });
-  const strangers = [];
+  const foreignRequests = [];
   const errors = [];
   page.on("request", (request) => {
-    if (!request.url().startsWith(address) && !/^(data|blob):/.test(request.url())) strangers.push(request.url());
+    if (!request.url().startsWith(address) && !/^(data|blob):/.test(request.url())) foreignRequests.push(request.url());
   });
   page.on("pageerror", (error) => errors.push(String(error)));
   page.on("console", (message) => message.type() === "error" && errors.push(message.text()));
@@ -58,7 +58,7 @@ try {
   await page.locator("#found").filter({ hasText: "No module has such a label" }).waitFor();
   await search.fill("");
 
-  // Some click into the map hits a module, and what is shown of it is found by its label.
+  // A click on the map selects a module, and the search finds it by its label.
   await page.keyboard.press("Escape");
   const details = page.locator("#module");
   await details.waitFor({ state: "hidden" });
@@ -94,7 +94,7 @@ try {
     await failed.scrollIntoViewIfNeeded();
     await shot("progress");
     await failed.filter({ hasText: "Mapped as model 3" }).waitFor();
-    // Its end opens the new model.
+    // The new model opens when the job ends.
     await page
       .locator("#models")
       .locator("option:checked")
@@ -122,7 +122,7 @@ try {
   } else {
     assert.deepEqual(errors, []);
   }
-  assert.deepEqual(strangers, [], "the page asked other hosts");
+  assert.deepEqual(foreignRequests, [], "the page asked other hosts");
   console.log("the page works");
 } finally {
   await browser.close();

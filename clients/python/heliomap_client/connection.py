@@ -104,7 +104,7 @@ class Connection:
                 with answer:
                     wait = answer.headers.get("Retry-After", "")
                     problem = Problem(answer.code, _document(answer), float(wait) if wait.isdigit() else None)
-                # What a later try may mend: busy, overloaded, standing still, interrupted, failing.
+                # Worth another attempt: busy, overloaded, stalled, interrupted, failing.
                 if attempt == tries or not (
                     answer.code in (408, 423, 429) or answer.code >= 500 or problem.code == "upload_interrupted"
                 ):
@@ -128,8 +128,8 @@ class Connection:
             with answer:
                 return answer.read()
 
-        told = self.send(method, path, headers, lambda: encoded, None, text)
-        return json.loads(told) if told else {}
+        received = self.send(method, path, headers, lambda: encoded, None, text)
+        return json.loads(received) if received else {}
 
     def items(self, path: str) -> Iterator[Json]:
         """All items of a list, part by part."""

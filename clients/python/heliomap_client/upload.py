@@ -202,7 +202,7 @@ def _resumed(connection: Connection, here: str, place: str, path: Path, digest: 
             ):
                 pending.set(here, place, digest, None)
                 raise
-            # What came counts: the service says how much that is.
+            # Bytes that arrived count: ask the service how many.
             with connection.open("HEAD", url, headers=TUS) as answer:
                 offset = int(answer.headers["Upload-Offset"])
             stalled = stalled + 1 if offset == before else 0

@@ -3,7 +3,7 @@
 {{- else }}{{ printf "%s-%s" .Release.Name .Chart.Name | trunc 50 | trimSuffix "-" }}{{ end -}}
 {{- end }}
 
-{{/* What tells the pods of one part of this release from all others; never changed. */}}
+{{/* The labels that select the pods of one part of this release; they must never change. */}}
 {{- define "heliomap.selector" -}}
 app.kubernetes.io/name: {{ .root.Chart.Name }}
 app.kubernetes.io/instance: {{ .root.Release.Name }}
@@ -74,14 +74,14 @@ capabilities:
 {{- end }}
 {{- end }}
 
-{{/* The label matchers by which Prometheus tells what this release's pods say from what others say. */}}
+{{/* The label matchers that select the metrics of this release's pods in Prometheus. */}}
 {{- define "heliomap.pods" -}}
 {{- $name := include "heliomap.name" . -}}
 {{- $pods := printf "namespace=\"%s\",pod=~\"%s-(server-[0-9]+|worker-[0-9a-z]+-[0-9a-z]+)\"" .Release.Namespace $name -}}
 {{ .Values.autoscaling.matchers | default $pods }}
 {{- end }}
 
-{{/* What servers alone are told: that clients' addresses are what a proxy says. */}}
+{{/* The environment of servers only: whether clients' addresses come from a proxy. */}}
 {{- define "heliomap.behindProxy" -}}
 {{- if kindIs "bool" .Values.server.behindProxy }}{{ .Values.server.behindProxy }}{{ else }}{{ .Values.ingress.enabled }}{{ end }}
 {{- end }}
