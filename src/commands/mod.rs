@@ -77,12 +77,12 @@ async fn open_storage(args: &StorageArgs) -> anyhow::Result<(Arc<dyn Store>, Blo
         Some(url) => Arc::new(PostgresStore::open(url).await.context("cannot use the database of --database")?),
         None => Arc::new(SqliteStore::open(&folder.join(ROWS)).await.with_context(hint)?),
     };
-    forget_what_is_over(&*store, &blobs).await.with_context(hint)?;
+    delete_expired(&*store, &blobs).await.with_context(hint)?;
     Ok((store, blobs))
 }
 
 /// Deletes expired data.
-async fn forget_what_is_over(store: &dyn Store, blobs: &Blobs) -> Result<(), StoreError> {
+async fn delete_expired(store: &dyn Store, blobs: &Blobs) -> Result<(), StoreError> {
     store.delete_expired_uploads(Timestamp::now()).await?;
     store.forget_old_requests(Timestamp::now()).await?;
     store.forget_old_deliveries(Timestamp::now() - OLD_DELIVERIES).await?;
@@ -204,7 +204,7 @@ fn keep_tidy(args: &RetentionArgs, store: &Arc<dyn Store>, blobs: &Blobs, stop: 
     tokio::spawn(async move {
         loop {
             let tidied = async {
-                forget_what_is_over(&*store, &blobs).await?;
+                delete_expired(&*store, &blobs).await?;
                 store.forget_audit(before(audited)).await?;
                 free_unused(&*store, &blobs, before(kept)).await
             };

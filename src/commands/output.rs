@@ -140,7 +140,7 @@ mod tests {
     use std::process::Command;
 
     #[test]
-    fn files_are_replaced_whole_and_everything_else_is_written_into() {
+    fn files_are_replaced_atomically_and_devices_are_written_into() {
         let folder = tempfile::tempdir().unwrap();
         let at = |name: &str| folder.path().join(name);
         std::fs::write(at("file"), "a document that is longer than the new one").unwrap();
@@ -162,7 +162,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_written_is_refused_before() {
+    fn unwritable_outputs_are_refused_before_the_work() {
         let folder = tempfile::tempdir().unwrap();
         let refused = |path: &Path| Output::named(path).unwrap_err().to_string();
         assert!(refused(folder.path()).contains("is a folder"));

@@ -36,11 +36,11 @@ class ClientTest(unittest.TestCase):
         lay_out_example(survey)
         target = self.folder / "plant.geojson"
         arguments = ["map", str(survey), "--plant", "Sunfield", "--survey", "June", "--out", str(target)]
-        told = io.StringIO()
-        with contextlib.redirect_stdout(told):
+        output = io.StringIO()
+        with contextlib.redirect_stdout(output):
             status = main(["--url", self.service.url, "--key", self.service.key, *arguments])
-        self.assertEqual(status, 0, told.getvalue())
-        self.assertIn("succeeded", told.getvalue())
+        self.assertEqual(status, 0, output.getvalue())
+        self.assertIn("succeeded", output.getvalue())
         modules = json.loads(target.read_text())["features"]
         counted = json.loads((survey / "truth.json").read_text())["counts"]["modules"]
         self.assertEqual(len(modules), counted)
@@ -54,7 +54,7 @@ class ClientTest(unittest.TestCase):
             client.module(plant, plant)
         self.assertEqual((raised.exception.status, raised.exception.code), (404, "module_not_found"))
 
-    def test_what_is_there_is_not_sent_again_and_what_is_wrong_is_told(self) -> None:
+    def test_unchanged_files_are_skipped_and_faults_are_reported(self) -> None:
         client = self.client("--no-worker")
         survey = self.folder / "survey"
         lay_out_example(survey)
@@ -118,7 +118,7 @@ class ClientTest(unittest.TestCase):
             client.open("HEAD", url, headers=uploading.TUS).headers["Upload-Offset"], str(cloud.stat().st_size)
         )
 
-    def test_a_key_for_one_plant_does_what_it_is_for_and_no_plant_is_made_by_mistake(self) -> None:
+    def test_a_key_for_one_plant_maps_it_and_creates_no_other(self) -> None:
         client = self.client("--no-worker")
         survey = self.folder / "survey"
         lay_out_example(survey)
@@ -128,15 +128,15 @@ class ClientTest(unittest.TestCase):
         def run(scope: str, *arguments: str) -> tuple[int, str]:
             asked = {"name": scope, "scopes": [scope], "plants": [plant]}
             key = client.call("POST", "/api/v1/keys", asked)["secret"]
-            told = io.StringIO()
-            with contextlib.redirect_stdout(told), contextlib.redirect_stderr(told):
+            output = io.StringIO()
+            with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
                 status = main(["--url", self.service.url, "--key", key, *arguments])
-            return status, told.getvalue()
+            return status, output.getvalue()
 
         here = ("--plant", "Sunfield", "--survey", "June")
         target = self.folder / "plant.geojson"
-        status, told = run("upload", "map", str(survey), *here, "--out", str(target))
-        self.assertEqual((status, "read" in told, "stored" in told), (1, True, False), told)
+        status, output = run("upload", "map", str(survey), *here, "--out", str(target))
+        self.assertEqual((status, "read" in output, "stored" in output), (1, True, False), output)
         self.assertEqual(run("upload", "upload", str(survey), *here)[0], 0)
         self.assertEqual(run("upload", "start", *here)[0], 0)
         for name, why in (
@@ -144,13 +144,13 @@ class ClientTest(unittest.TestCase):
             ("Sunfeld", "no plant of the name"),
             ("Sunfield North", "no plant"),
         ):
-            status, told = run("read", "fetch", "--plant", name, "--out", str(target))
-            self.assertEqual((status, why in told), (1, True), told)
-        status, told = run("upload", "start", "--plant", "Sunfield", "--survey", "Jun")
-        self.assertEqual((status, "no survey of the name" in told), (1, True), told)
+            status, output = run("read", "fetch", "--plant", name, "--out", str(target))
+            self.assertEqual((status, why in output), (1, True), output)
+        status, output = run("upload", "start", "--plant", "Sunfield", "--survey", "Jun")
+        self.assertEqual((status, "no survey of the name" in output), (1, True), output)
         self.assertEqual([plant["name"] for plant in client.plants()], ["Sunfield", "Sunfield North"])
 
-    def test_an_answer_that_breaks_off_is_asked_for_again(self) -> None:
+    def test_a_truncated_response_is_requested_again(self) -> None:
         whole = json.dumps({"type": "FeatureCollection", "features": [], "padding": "x" * 100_000}).encode()
         answers: list[str] = []
 
@@ -190,7 +190,7 @@ class ClientTest(unittest.TestCase):
             client.fetch_layer("p", target)
         self.assertEqual(list(self.folder.iterdir()), [])
 
-    def test_a_key_that_is_not_good_is_told_at_once(self) -> None:
+    def test_an_invalid_key_fails_at_once(self) -> None:
         self.client("--no-worker")
         stranger = Client(self.service.url, "hm_wrong")
         with self.assertRaises(Problem) as raised:
