@@ -121,6 +121,7 @@ fn parse() -> anyhow::Result<Cli> {
 mod tests {
     use super::*;
     use heliomap::config::Limits;
+    use std::time::Duration;
 
     #[test]
     fn causes_are_not_repeated() {
@@ -134,6 +135,21 @@ mod tests {
     #[test]
     fn the_command_line_is_consistent() {
         Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn flags_of_version_0_1_are_accepted() {
+        let map = Cli::command().get_matches_from(["heliomap", "map", "folder", "--max-megapixels", "2"]);
+        let map = map.subcommand_matches("map").unwrap();
+        assert_eq!(map.get_one("max_image_megapixels"), Some(&2.0));
+        let keys = ["heliomap", "keys", "create", "--name", "a", "--scope", "read", "--days", "3"];
+        let keys = Cli::command().get_matches_from(keys);
+        let create = keys.subcommand_matches("keys").and_then(|keys| keys.subcommand_matches("create")).unwrap();
+        assert_eq!(create.get_one("expires_after"), Some(&Duration::from_secs(3 * 24 * 3600)));
+        let worker = Cli::command().get_matches_from(["heliomap", "worker", "--lease", "2", "--keep-audit", "7"]);
+        let worker = worker.subcommand_matches("worker").unwrap();
+        assert_eq!(worker.get_one("lease"), Some(&Duration::from_secs(2)));
+        assert_eq!(worker.get_one("keep_audit"), Some(&Duration::from_secs(7 * 24 * 3600)));
     }
 
     #[test]

@@ -164,8 +164,9 @@ mod tests {
         let origins = Arg::new("origin").long("origin").env("T_ORIGIN").value_delimiter(',').action(ArgAction::Append);
         let open = Arg::new("open").long("open").env("T_OPEN").action(ArgAction::SetTrue);
         let secret = Arg::new("database").long("database").env("T_DB").hide_env_values(true);
+        let pixels = Arg::new("pixels").long("max-image-megapixels").env("T_MP").value_parser(value_parser!(f64));
         let once = Arg::new("once").long("once");
-        Command::new("t").subcommand(Command::new("serve").args([listen, size, origins, open, secret, once]))
+        Command::new("t").subcommand(Command::new("serve").args([listen, size, origins, open, secret, pixels, once]))
     }
 
     fn with(text: &str) -> Result<Command, ConfigError> {
@@ -188,6 +189,12 @@ mod tests {
         assert_eq!(matches.get_one::<String>("listen").unwrap(), "c");
         assert_eq!(matches.get_many::<String>("origin").unwrap().collect::<Vec<_>>(), ["z"]);
         assert!(with("").is_ok() && with("listen:\n").is_ok());
+    }
+
+    #[test]
+    fn keys_of_version_0_1_are_accepted() {
+        let matches = with("max-megapixels: 7.5").unwrap().get_matches_from(["t", "serve"]);
+        assert_eq!(matches.subcommand_matches("serve").unwrap().get_one("pixels"), Some(&7.5));
     }
 
     #[test]

@@ -24,6 +24,7 @@ pub fn heliomap(arguments: &[&str]) -> Said {
         .env_remove("HELIOMAP_DETECTOR")
         .env_remove("HELIOMAP_THREADS")
         .env_remove("HELIOMAP_MAX_MEGAPIXELS")
+        .env_remove("HELIOMAP_MAX_IMAGE_MEGAPIXELS")
         .output()
         .unwrap();
     Said {

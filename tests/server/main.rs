@@ -350,7 +350,7 @@ fn a_reader_who_goes_is_no_fault_but_no_secret_is_lost() {
     assert_eq!(unread(&["openapi"], data.path()).status.code(), Some(0));
     let lost = unread(&["keys", "create", "--name", "lost", "--scope", "read"], data.path());
     let text = String::from_utf8(lost.stderr).unwrap();
-    assert!(lost.status.code() == Some(1) && text.contains("it is revoked"), "{text}");
+    assert!(lost.status.code() == Some(1) && text.contains("the key is revoked"), "{text}");
     let mut command = Command::new(env!("CARGO_BIN_EXE_heliomap"));
     let listed = command.args(["keys", "list", "--data-dir"]).arg(data.path()).output().unwrap();
     let listed = String::from_utf8(listed.stdout).unwrap();
