@@ -91,7 +91,7 @@ fn a_service_that_is_well() {
         .unwrap();
     let text = String::from_utf8(output.stdout).unwrap();
     assert!(output.status.success() && text.contains("warning  configuration: --insecure"), "{text}");
-    assert!(text.contains("         -> leave --insecure out"), "{text}");
+    assert!(text.contains("         -> omit --insecure"), "{text}");
 }
 
 #[test]
