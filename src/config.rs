@@ -15,7 +15,6 @@ pub use mapping::StartJob;
 use units::{parse_days, parse_megapixels, parse_seconds};
 
 use crate::store::Bucket;
-use crate::webhooks::Targets;
 use axum::http::HeaderValue;
 use clap::{Args, ValueEnum};
 use heliomap_mapping::detection::{self, DetectionError, Detector, ExecutionProvider, RuntimeSettings};
@@ -108,13 +107,6 @@ pub struct WebhookArgs {
     /// this service send requests to every address that it can reach.
     #[arg(long, env = "HELIOMAP_WEBHOOK_PRIVATE_TARGETS")]
     pub webhook_private_targets: bool,
-}
-
-impl WebhookArgs {
-    /// Where they may lead.
-    pub fn targets(&self) -> Targets {
-        if self.webhook_private_targets { Targets::Any } else { Targets::Public }
-    }
 }
 
 /// Where the process serves its metrics.

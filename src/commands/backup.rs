@@ -6,7 +6,7 @@ use anyhow::{Context, bail, ensure};
 use futures::{Stream, TryStreamExt, stream};
 use heliomap::config::{BackupArgs, RestoreArgs, StorageArgs, VerifyArgs};
 use heliomap::store::schema::Schema;
-use heliomap::store::{BlobRecord, Blobs, Digest, SqliteStore, StagedFile, Store, UploadStore};
+use heliomap::store::{BlobRecord, Blobs, Digest, PlantStore, SqliteStore, StagedFile, Store, UploadStore};
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use std::io::{ErrorKind, Write};

@@ -22,7 +22,7 @@ use heliomap::store::freeing::free_unused;
 use heliomap::store::schema::Schema;
 use heliomap::store::{Blobs, PostgresStore, SqliteStore, Store, StoreError};
 use heliomap::telemetry::metrics::{self, Metrics, Scrape};
-use heliomap::webhooks::{Sender, SenderSettings};
+use heliomap::webhooks::{Sender, SenderSettings, Targets};
 use jiff::Timestamp;
 use object_store::aws::AmazonS3Builder;
 use std::path::Path;
@@ -164,7 +164,7 @@ fn pipeline_worker(
     mapper: Arc<PipelineMapper>,
     jobs: &JobArgs,
     metrics: Metrics,
-    bell: Arc<Notify>,
+    work_notify: Arc<Notify>,
 ) -> Worker {
     Worker {
         name: format!("{}-{}", std::process::id(), &uuid::Uuid::new_v4().simple().to_string()[..8]),
@@ -173,7 +173,7 @@ fn pipeline_worker(
         mapper,
         settings: WorkerSettings::with_lease(jobs.lease),
         metrics,
-        bell,
+        work_notify,
     }
 }
 
@@ -184,7 +184,12 @@ fn send_messages(
     metrics: &Metrics,
     stop: &CancellationToken,
 ) -> JoinHandle<()> {
-    let sender = Sender::new(store.clone(), args.targets(), SenderSettings::default(), metrics.clone());
+    let sender = Sender::new(
+        store.clone(),
+        Targets::allowing_private(args.webhook_private_targets),
+        SenderSettings::default(),
+        metrics.clone(),
+    );
     let stop = stop.clone();
     tokio::spawn(async move {
         match sender {

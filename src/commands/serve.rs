@@ -10,6 +10,7 @@ use heliomap::http::{self, AppState};
 use heliomap::oidc::Oidc;
 use heliomap::store::{Page, TimeSpan};
 use heliomap::telemetry::metrics::Scrape;
+use heliomap::webhooks::Targets;
 use std::sync::Arc;
 use tokio::net::TcpListener;
 use tokio::sync::Notify;
@@ -46,7 +47,7 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
             bell: Arc::new(Notify::new()),
             stop: stop.clone(),
             oidc,
-            targets: args.webhooks.targets(),
+            targets: Targets::allowing_private(args.webhooks.webhook_private_targets),
             mapper: mapper.clone(),
             insecure: args.insecure,
             ..AppState::new(store.clone(), blobs.clone(), limits.clone())

@@ -175,10 +175,10 @@ impl From<StoreError> for ApiError {
         match &error {
             StoreError::Gone { what: "plant" } => Self::new(Code::PlantNotFound, "the plant was deleted meanwhile"),
             StoreError::OverQuota { what, used, quota } => crate::http::controllers::usage::over_quota(what, *used, *quota),
-            StoreError::TooManyUploads { open, most } => Self::new(
+            StoreError::TooManyUploads { open, max } => Self::new(
                 Code::TooManyUploads,
                 format!(
-                    "the organisation has {open} unfinished uploads of the {most} that it may have at once: go on with some of \
+                    "the organisation has {open} unfinished uploads of the {max} that it may have at once: go on with some of \
                      them or end them, `GET` of a survey's uploads with `state=unfinished` lists them; else they end by themselves"
                 ),
             )

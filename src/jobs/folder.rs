@@ -1,7 +1,7 @@
-//! The folder of a job: the survey's files, laid out as OpenSfM leaves them. Photos come when they are looked at and leave
-//! when that is done: a job begins before they were fetched, and needs no room for all of them.
+//! The folder of a job: the survey's files, laid out as OpenSfM leaves them. Each photo is fetched when it is read and deleted
+//! afterwards: a job begins at once, and needs no disk space for all of them.
 
-use super::AttemptError;
+use super::error::AttemptError;
 use crate::store::{Blobs, Digest, FileKind, FileRecord, StoreError};
 use futures::{StreamExt, TryStreamExt, stream};
 use heliomap_mapping::reconstruction::photo::{Photo, PhotoError, PhotoHeader};
@@ -13,10 +13,10 @@ use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 use tokio::runtime::Handle;
 
-/// Files that come from a bucket at once.
+/// Files fetched from a bucket at once.
 const FILES_AT_ONCE: usize = 8;
 
-/// What is known of a photo without its file, from when it was uploaded.
+/// What the upload recorded of a photo.
 #[derive(Debug)]
 struct Kept {
     sha256: Digest,
@@ -96,8 +96,8 @@ impl ProjectFolder for JobFolder {
 
     fn load(&self, photo: &Photo) -> Result<RgbImage, ReadError> {
         let not_fetched = |error: AttemptError| {
-            tracing::error!(%error, image = photo.shot, "a photo cannot be fetched");
-            let reason = "the service's storage failed; its log says more".to_owned();
+            tracing::error!(%error, image = photo.shot, "cannot fetch a photo");
+            let reason = "the service's storage failed; see the log of the service".to_owned();
             ReadError::NotFetched { name: photo.shot.clone(), reason }
         };
         // In a folder of its own, which goes when the photo is in memory.

@@ -1,7 +1,11 @@
-//! A worker without a job of its own helps with the images of those that run.
+//! A worker without a job runs image tasks of other workers' jobs.
 
-use super::{AttemptError, Mapper, Worker, share};
-use crate::store::{GivenBack, StoreError, TaskClaim};
+use super::error::AttemptError;
+use super::mapper::Mapper;
+use super::publisher::read_task;
+use super::settings::WorkerSettings;
+use crate::store::{Blobs, GivenBack, Store, StoreError, TaskClaim};
+use crate::telemetry::Metrics;
 use heliomap_mapping::pipeline::{Found, Loaded, MapError};
 use jiff::Timestamp;
 use std::collections::HashMap;
@@ -11,17 +15,17 @@ use tokio::runtime::Handle;
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
-/// The tasks in this worker's hands.
+/// The tasks that this worker holds.
 #[derive(Debug, Default)]
-struct Hands {
-    held: Mutex<HashMap<Uuid, TaskClaim>>,
-    /// Raised when no more are to be taken and those held are to be left.
+struct HeldTasks {
+    tasks: Mutex<HashMap<Uuid, TaskClaim>>,
+    /// Set when no more tasks are to be taken and those held are to be given back.
     stop: AtomicBool,
 }
 
-impl Hands {
-    fn held(&self) -> MutexGuard<'_, HashMap<Uuid, TaskClaim>> {
-        self.held.lock().unwrap_or_else(PoisonError::into_inner)
+impl HeldTasks {
+    fn tasks(&self) -> MutexGuard<'_, HashMap<Uuid, TaskClaim>> {
+        self.tasks.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn stopped(&self) -> bool {
@@ -29,12 +33,22 @@ impl Hands {
     }
 }
 
-impl Worker {
-    /// Searches images of other workers' jobs for as long as there are some and no job waits; how many that were.
+/// Runs image tasks of other workers' jobs.
+#[derive(Clone)]
+pub(super) struct Helper {
+    pub store: Arc<dyn Store>,
+    pub blobs: Blobs,
+    pub mapper: Arc<dyn Mapper>,
+    pub settings: WorkerSettings,
+    pub metrics: Metrics,
+}
+
+impl Helper {
+    /// Runs tasks of other workers' jobs for as long as there are some and no job waits; returns how many.
     ///
     /// # Errors
     /// A detector that cannot be opened or fails; a store that does not answer.
-    pub(super) async fn help(&self, stop: &CancellationToken) -> Result<usize, AttemptError> {
+    pub async fn help(&self, stop: &CancellationToken) -> Result<usize, AttemptError> {
         if self.store.waiting_tasks(Timestamp::now()).await? == 0 {
             return Ok(0);
         }
@@ -44,111 +58,111 @@ impl Worker {
         let Some(first) = self.store.take_task(&identity, self.settings.lease, Timestamp::now()).await? else {
             return Ok(0);
         };
-        tracing::info!(job = %first.job, "helps with the images of a job");
-        let hands = Arc::new(Hands::default());
-        hands.held().insert(first.token, first.clone());
-        let errands = Errands {
-            worker: self.clone(),
-            hands: hands.clone(),
+        tracing::info!(job = %first.job, "helping with the images of a job");
+        let held = Arc::new(HeldTasks::default());
+        held.tasks().insert(first.token, first.clone());
+        let runner = TaskRunner {
+            helper: self.clone(),
+            held: held.clone(),
             identity,
             first: Some(first),
             runtime: Handle::current(),
         };
-        let searching = tokio::task::spawn_blocking(move || errands.run());
+        let searching = tokio::task::spawn_blocking(move || runner.run());
         tokio::pin!(searching);
         let outcome = tokio::select! {
             outcome = &mut searching => Some(outcome),
-            () = self.keep_hands(&hands, stop) => None,
+            () = self.extend_leases(&held, stop) => None,
         };
         let outcome = match outcome {
             Some(outcome) => outcome,
             None => {
-                // Others need not wait for the leases to end, nor for the image that is being searched.
-                self.leave(&hands).await;
+                // Others need not wait for the leases to expire, nor for the image that is being processed.
+                self.give_back(&held).await;
                 searching.await
             }
         };
         let outcome = outcome.map_err(|_| AttemptError::Panicked).flatten();
-        self.leave(&hands).await;
+        self.give_back(&held).await;
         match outcome {
             Err(AttemptError::Map(MapError::Cancelled)) => Ok(0),
             other => other,
         }
     }
 
-    /// Extends the leases for as long as it is polled, until the worker is told to stop.
-    async fn keep_hands(&self, hands: &Hands, stop: &CancellationToken) {
+    /// Extends the leases of held tasks until `stop`.
+    async fn extend_leases(&self, held: &HeldTasks, stop: &CancellationToken) {
         loop {
             tokio::select! {
                 () = tokio::time::sleep(self.settings.heartbeat) => {}
                 () = stop.cancelled() => {
-                    hands.stop.store(true, Ordering::Release);
+                    held.stop.store(true, Ordering::Release);
                     return;
                 }
             }
-            let tokens: Vec<Uuid> = hands.held().keys().copied().collect();
+            let tokens: Vec<Uuid> = held.tasks().keys().copied().collect();
             let extended = self.store.extend_tasks(&tokens, self.settings.lease, Timestamp::now());
             let extended = tokio::time::timeout(self.settings.lease, extended).await;
             match extended.unwrap_or(Err(StoreError::Silent)) {
-                // What is lost meanwhile is dropped when it is found.
-                Ok(held) if held.len() < tokens.len() => tracing::info!("a job that this worker helps with is over"),
+                // Results of lost tasks are discarded later.
+                Ok(kept) if kept.len() < tokens.len() => tracing::info!("a job that this worker helps with has ended"),
                 Ok(_) => {}
-                Err(error) => tracing::warn!(%error, "the leases of images cannot be extended"),
+                Err(error) => tracing::warn!(%error, "cannot extend the leases of images"),
             }
         }
     }
 
     /// Gives back all tasks that are still held.
-    async fn leave(&self, hands: &Hands) {
-        let held: Vec<TaskClaim> = hands.held().drain().map(|(_, claim)| claim).collect();
+    async fn give_back(&self, held: &HeldTasks) {
+        let held: Vec<TaskClaim> = held.tasks().drain().map(|(_, claim)| claim).collect();
         for claim in held {
             if let Err(error) = self.store.give_back_task(&claim, GivenBack::ToAll).await {
-                tracing::warn!(%error, "an image cannot be given back; its lease ends");
+                tracing::warn!(%error, "cannot give back an image; its lease will expire");
             }
         }
     }
 }
 
-/// The tasks that are taken and searched one after the other, on threads that may block.
-struct Errands {
-    worker: Worker,
-    hands: Arc<Hands>,
+/// Takes and runs tasks one after the other, on threads that may block.
+struct TaskRunner {
+    helper: Helper,
+    held: Arc<HeldTasks>,
     identity: String,
     first: Option<TaskClaim>,
     runtime: Handle,
 }
 
-impl Errands {
-    /// How many images were searched.
+impl TaskRunner {
+    /// Runs until there are no more tasks; returns how many were completed.
     fn run(mut self) -> Result<usize, AttemptError> {
-        let (worker, hands, runtime) = (self.worker.clone(), self.hands.clone(), self.runtime.clone());
-        let mapper: Arc<dyn Mapper> = worker.mapper.clone();
-        let mut searched = 0;
+        let (helper, held, runtime) = (self.helper.clone(), self.held.clone(), self.runtime.clone());
+        let mapper: Arc<dyn Mapper> = helper.mapper.clone();
+        let mut completed = 0;
         let mut found = |claim: TaskClaim, found: Found| {
-            hands.held().remove(&claim.token);
+            held.tasks().remove(&claim.token);
             let mut document = Vec::new();
             if ciborium::into_writer(&found, &mut document).is_err() {
                 return;
             }
-            match runtime.block_on(worker.store.finish_task(&claim, &document)) {
+            match runtime.block_on(helper.store.finish_task(&claim, &document)) {
                 Ok(true) => {
-                    searched += 1;
-                    worker.metrics.images_helped.inc();
+                    completed += 1;
+                    helper.metrics.images_helped.inc();
                 }
-                Ok(false) => tracing::info!(job = %claim.job, "an image was searched that is in other hands by now"),
-                Err(error) => tracing::warn!(%error, "what was found in an image cannot be kept"),
+                Ok(false) => tracing::info!(job = %claim.job, "lease of an image lost; discarding result"),
+                Err(error) => tracing::warn!(%error, "cannot store the result of an image"),
             }
         };
-        let stopping = self.hands.clone();
+        let stopping = self.held.clone();
         let mut next = || self.next();
         mapper.search(&mut next, &mut found, &move || stopping.stopped())?;
-        Ok(searched)
+        Ok(completed)
     }
 
-    /// The next image, loaded; `None` where there is no more for this worker.
+    /// The next image, loaded; `None` where this worker gets no more.
     fn next(&mut self) -> Option<Result<Loaded<TaskClaim>, MapError>> {
         loop {
-            if self.hands.stopped() {
+            if self.held.stopped() {
                 return None;
             }
             let claim = match self.first.take() {
@@ -158,12 +172,12 @@ impl Errands {
             match self.runtime.block_on(self.load(&claim)) {
                 Ok(loaded) => return Some(Ok(loaded)),
                 Err(error) => {
-                    self.hands.held().remove(&claim.token);
-                    // The job's own worker has the photo, or says better what is wrong with it.
-                    tracing::warn!(%error, job = %claim.job, image = claim.task.image, "an image is left to its job");
-                    let back = self.worker.store.give_back_task(&claim, GivenBack::ToOwner);
+                    self.held.tasks().remove(&claim.token);
+                    // The job's own worker has the photo, or reports what is wrong with it.
+                    tracing::warn!(%error, job = %claim.job, image = claim.task.image, "leaving an image to its job's own worker");
+                    let back = self.helper.store.give_back_task(&claim, GivenBack::ToOwner);
                     if let Err(error) = self.runtime.block_on(back) {
-                        tracing::warn!(%error, "an image cannot be given back; its lease ends");
+                        tracing::warn!(%error, "cannot give back an image; its lease will expire");
                         return None;
                     }
                 }
@@ -173,7 +187,7 @@ impl Errands {
 
     /// Takes another task, unless a job waits, which comes first.
     fn take(&self) -> Option<TaskClaim> {
-        let (store, lease) = (&self.worker.store, self.worker.settings.lease);
+        let (store, lease) = (&self.helper.store, self.helper.settings.lease);
         let taken = self.runtime.block_on(async {
             let now = Timestamp::now();
             if store.queue(now).await?.waiting > 0 {
@@ -185,25 +199,25 @@ impl Errands {
         match taken {
             Ok(taken) => {
                 let claim = taken?;
-                self.hands.held().insert(claim.token, claim.clone());
+                self.held.tasks().insert(claim.token, claim.clone());
                 Some(claim)
             }
             Err(error) => {
-                tracing::warn!(%error, "cannot look for images of other workers' jobs");
+                tracing::warn!(%error, "cannot look for image tasks");
                 None
             }
         }
     }
 
     async fn load(&self, claim: &TaskClaim) -> Result<Loaded<TaskClaim>, AttemptError> {
-        let (errand, sha256) = share::errand(&claim.task.document, claim.plant)?;
-        let blobs = &self.worker.blobs;
+        let (task, sha256) = read_task(&claim.task.document, claim.plant)?;
+        let blobs = &self.helper.blobs;
         let folder = tempfile::Builder::new().prefix("image-").tempdir_in(blobs.staging())?;
-        let name = errand.sought.path.file_name().ok_or(StoreError::Gone { what: "image" })?;
+        let name = task.request.path.file_name().ok_or(StoreError::Gone { what: "image" })?;
         let path = folder.path().join(name);
         blobs.place(claim.plant, sha256, &path).await?;
-        let pixels = errand.sought.load(&path)?;
-        let (image, gsd_m) = (errand.sought.image, errand.sought.gsd_m);
+        let pixels = task.request.load(&path)?;
+        let (image, gsd_m) = (task.request.image, task.request.gsd_m);
         Ok(Loaded { key: claim.clone(), image, pixels, gsd_m })
     }
 }

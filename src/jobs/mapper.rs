@@ -10,8 +10,8 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError, TryLockError};
 
 /// Maps the plant in a folder. Called on a thread of its own.
 pub trait Mapper: Send + Sync + 'static {
-    /// As [`pipeline::map_folder`], of which only the model counts.
-    fn map(
+    /// Runs [`pipeline::map_folder`] and returns the model.
+    fn run(
         &self,
         folder: &dyn ProjectFolder,
         options: &MapOptions,
@@ -19,27 +19,27 @@ pub trait Mapper: Send + Sync + 'static {
         observer: &dyn Observer,
     ) -> Result<PlantModel, MapError>;
 
-    /// Searches images of other workers' mappings, as [`search::search`] does, and hands each to `found`.
+    /// Runs the detector on images of other workers' jobs, as [`search::search`] does, and hands each result to `found`.
     fn search(&self, next: &mut NextTask<'_>, found: &mut FoundInTask<'_>, stop: &Stopped<'_>) -> Result<(), MapError>;
 
-    /// Tells this mapper from every other that may find something else in the same images.
+    /// Identifies mappers that give the same results: equal only for equal programs with equal detectors.
     fn identity(&self) -> String;
 }
 
-/// Gives the next image of another worker's mapping.
+/// Gives the next image of another worker's job.
 pub type NextTask<'a> = dyn FnMut() -> Option<Result<Loaded<TaskClaim>, MapError>> + Send + 'a;
-/// Takes what was found in one.
+/// Takes the result of an image.
 pub type FoundInTask<'a> = dyn FnMut(TaskClaim, Found) + Send + 'a;
 /// Whether to stop.
 pub type Stopped<'a> = dyn Fn() -> bool + Sync + 'a;
 
-/// The file of a survey whose boxes stand in the place of a detector.
+/// The file of a survey with boxes to use instead of a detector.
 const BOXES_FILE: &str = "boxes.json";
 
 /// Opens a detector.
 pub type OpenDetector = dyn Fn() -> Result<Arc<dyn Detector>, DetectionError> + Send + Sync;
 
-/// The pipeline with its detector, which is opened once and kept; where it cannot be opened, every job tries again.
+/// The pipeline with its detector, which is opened once and kept. Where it cannot be opened, every job tries again.
 pub struct PipelineMapper {
     open: Box<OpenDetector>,
     detector: Mutex<Option<Arc<dyn Detector>>>,
@@ -51,10 +51,10 @@ impl PipelineMapper {
         Self { open, detector: Mutex::new(None) }
     }
 
-    /// Opens the detector, so that what is wrong with it is known before a job needs it.
+    /// Opens the detector, so that errors appear before a job needs it.
     ///
     /// # Errors
-    /// What is wrong with it.
+    /// A detector that cannot be opened.
     pub fn open(&self) -> Result<(), DetectionError> {
         self.opened().map(drop)
     }
@@ -85,7 +85,7 @@ impl PipelineMapper {
 }
 
 impl Mapper for PipelineMapper {
-    fn map(
+    fn run(
         &self,
         folder: &dyn ProjectFolder,
         options: &MapOptions,
@@ -117,7 +117,7 @@ impl Mapper for PipelineMapper {
     }
 }
 
-/// The digest of this program's file: any other build may find something else. One that cannot be read is like no other.
+/// The digest of this program's file: another build may give other results. A file that cannot be read is never equal.
 fn program() -> &'static str {
     static PROGRAM: OnceLock<String> = OnceLock::new();
     PROGRAM.get_or_init(|| {
@@ -126,7 +126,7 @@ fn program() -> &'static str {
     })
 }
 
-/// Files by their names in the survey: where the worker laid them is nobody's business.
+/// Replaces paths in this worker's folders by the names of the survey's files.
 fn as_in_the_survey(error: MapError, folder: &Path) -> MapError {
     match error {
         MapError::Input { code, message } => {

@@ -63,8 +63,7 @@ pub fn missing(files: &[FileRecord]) -> Vec<Missing> {
     missing
 }
 
-/// The images from which a survey's reconstruction was made; `None` where there is no reconstruction, or none that could be
-/// read.
+/// The images from which a survey's reconstruction was made; `None` without a readable reconstruction.
 pub fn shots(files: &[FileRecord]) -> Option<&[String]> {
     let reconstruction = RECONSTRUCTIONS.iter().find_map(|path| files.iter().find(|file| file.path.as_str() == *path));
     reconstruction?.shots.as_deref()

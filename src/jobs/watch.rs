@@ -1,6 +1,6 @@
-//! What the mapping thread and the worker tell each other while a job runs.
+//! What the mapping thread and the worker exchange while a job runs: progress, checkpoints, the order to stop.
 
-use super::share::Share;
+use super::publisher::TaskPublisher;
 use crate::store::{Checkpoint, Progress};
 use heliomap_mapping::fusion::Fused;
 use heliomap_mapping::pipeline::{Found, ImageRequest, NextImage, Observer, Stage};
@@ -12,12 +12,12 @@ use std::sync::{Mutex, MutexGuard, OnceLock};
 use std::time::Instant;
 use tracing::Span;
 
-/// How checkpoints of the fused structure are called, before the number of the part: as no image is.
+/// Prefix of the names of checkpoints of the fused structure, before the number of the part. No image is called so.
 const STRUCTURE: &str = "fused structure/";
-/// Bytes of one such part.
+/// Size of one such part, bytes.
 const PART_BYTES: usize = 8 << 20;
-/// Bytes after which what was found waits for its turn: heartbeats go on in between.
-const BYTES_AT_ONCE: usize = PART_BYTES;
+/// Checkpoints are stored in batches of about this many bytes, so that heartbeats go on in between.
+const BATCH_BYTES: usize = PART_BYTES;
 
 /// Why a running job must stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -26,11 +26,11 @@ pub enum Stop {
     Cancelled = 1,
     /// The worker shuts down.
     Shutdown = 2,
-    /// The job is in other hands, or gone.
+    /// Its lease was lost: another worker has the job, or it was deleted.
     Lost = 3,
 }
 
-/// What each stage of a mapping of so many images took.
+/// Duration of each stage of a mapping of so many images.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Pace {
     pub images: u64,
@@ -38,39 +38,39 @@ pub struct Pace {
 }
 
 impl Pace {
-    /// What a stage takes for so many images.
+    /// Expected duration of a stage for so many images.
     fn expected_ms(&self, stage: Stage, images: u64) -> Option<u64> {
         Some(self.stage_ms.get(stage.as_str())? * images / self.images.max(1))
     }
 }
 
-/// What was seen of a mapping.
+/// Progress of a mapping.
 #[derive(Debug, Default)]
-struct Seen {
+struct Timeline {
     now: Option<(Stage, usize, usize)>,
-    /// When each stage was first heard of, in order.
+    /// When each stage began, in order.
     begun: Vec<(Stage, Instant)>,
     images: u64,
-    /// How many images were recalled, which takes no time.
-    recalled: u64,
-    /// Whether the structure was, too.
-    structure_recalled: bool,
-    /// The span of the stage that runs, which ends when it is dropped.
+    /// How many images came from checkpoints, which takes no time.
+    restored: u64,
+    /// Whether the fused structure did, too.
+    structure_restored: bool,
+    /// The span of the running stage, which ends when it is dropped.
     span: Option<Span>,
 }
 
-/// What a job has found, and what an earlier attempt at it had.
+/// Checkpoints of a job: those of earlier attempts, and new ones to be stored.
 #[derive(Debug, Default)]
-struct Findings {
+struct Checkpoints {
     fingerprint: String,
     known: HashMap<String, Found>,
-    /// The parts of a structure that an earlier attempt had fused, in order.
+    /// The parts of the structure that an earlier attempt fused, in order.
     structure: Parts,
     fresh: VecDeque<Checkpoint>,
     last: Option<Pace>,
 }
 
-/// Bytes in parts, one after the other; what was read is dropped.
+/// Bytes in parts, one after the other; parts that were read are dropped.
 #[derive(Debug, Default)]
 struct Parts(VecDeque<Cursor<Vec<u8>>>);
 
@@ -86,15 +86,14 @@ impl Read for Parts {
     }
 }
 
-/// One job's progress, findings and stop sign.
+/// Progress, checkpoints and stop flag of one job.
 pub struct Watch {
-    seen: Mutex<Seen>,
-    findings: Mutex<Findings>,
+    timeline: Mutex<Timeline>,
+    checkpoints: Mutex<Checkpoints>,
     stop: AtomicU8,
-    /// The job's span, that of its stages stand in.
+    /// The job's span, parent of those of its stages.
     span: Span,
-    /// How its images are shared with other workers.
-    share: OnceLock<Share>,
+    publisher: OnceLock<TaskPublisher>,
 }
 
 fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -102,14 +101,14 @@ fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl Default for Watch {
-    /// Of a job whose span is the current one.
+    /// For a job whose span is the current one.
     fn default() -> Self {
         Self {
-            seen: Mutex::default(),
-            findings: Mutex::default(),
+            timeline: Mutex::default(),
+            checkpoints: Mutex::default(),
             stop: AtomicU8::new(0),
             span: Span::current(),
-            share: OnceLock::new(),
+            publisher: OnceLock::new(),
         }
     }
 }
@@ -117,10 +116,10 @@ impl Default for Watch {
 impl Watch {
     /// Ends the span of the stage that ran last.
     pub fn end(&self) {
-        locked(&self.seen).span = None;
+        locked(&self.timeline).span = None;
     }
 
-    /// Raises the stop sign; the first reason stays, but a lost job is lost whatever else was asked.
+    /// Orders the mapping to stop. The first reason stays, but a lost lease overrides all others.
     pub fn stop(&self, reason: Stop) {
         if reason == Stop::Lost {
             self.stop.store(reason as u8, Ordering::Release);
@@ -129,7 +128,7 @@ impl Watch {
         }
     }
 
-    /// Why the job must stop, where it must.
+    /// The reason to stop, where there is one.
     pub fn stopped(&self) -> Option<Stop> {
         match self.stop.load(Ordering::Acquire) {
             1 => Some(Stop::Cancelled),
@@ -139,74 +138,74 @@ impl Watch {
         }
     }
 
-    /// Tells what an earlier attempt had found under this fingerprint, and what the stages of the last job took.
+    /// Sets the checkpoints of earlier attempts under this fingerprint, and the durations of the last job's stages.
     pub fn begin(&self, fingerprint: String, known: Vec<Checkpoint>, last: Option<Pace>) {
         let (mut parts, images): (Vec<_>, Vec<_>) =
             known.into_iter().partition(|kept| kept.name.starts_with(STRUCTURE));
         let known = images
             .into_iter()
-            // One that cannot be read is found again.
+            // An image whose checkpoint cannot be read is processed again.
             .filter_map(|kept| Some((kept.name, ciborium::from_reader(kept.document.as_slice()).ok()?)))
             .collect();
         parts.sort_by(|one, other| one.name.cmp(&other.name));
         let structure = Parts(parts.into_iter().map(|part| Cursor::new(part.document)).collect());
-        *locked(&self.findings) = Findings { fingerprint, known, structure, fresh: VecDeque::new(), last };
+        *locked(&self.checkpoints) = Checkpoints { fingerprint, known, structure, fresh: VecDeque::new(), last };
     }
 
-    /// Tells how images are shared from now on.
-    pub fn share(&self, share: Share) {
-        let _ = self.share.set(share);
+    /// Publishes the job's images from now on.
+    pub fn publish_by(&self, publisher: TaskPublisher) {
+        let _ = self.publisher.set(publisher);
     }
 
-    /// What was found since the last time, or as much of it as is stored in a moment, and under which fingerprint.
-    pub fn take_found(&self) -> (String, Vec<Checkpoint>) {
-        let mut findings = locked(&self.findings);
+    /// The next batch of new checkpoints, and their fingerprint.
+    pub fn take_checkpoints(&self) -> (String, Vec<Checkpoint>) {
+        let mut checkpoints = locked(&self.checkpoints);
         let mut bytes = 0;
-        let parts = findings.fresh.iter().take_while(|found| {
-            let begins_in_time = bytes < BYTES_AT_ONCE;
+        let parts = checkpoints.fresh.iter().take_while(|found| {
+            let begins_in_time = bytes < BATCH_BYTES;
             bytes += found.document.len();
             begins_in_time
         });
         let count = parts.count();
-        (findings.fingerprint.clone(), findings.fresh.drain(..count).collect())
+        (checkpoints.fingerprint.clone(), checkpoints.fresh.drain(..count).collect())
     }
 
-    /// Takes back what could not be stored: before what was found since, which may rest on it.
-    pub fn give_back(&self, found: Vec<Checkpoint>) {
-        let mut findings = locked(&self.findings);
+    /// Takes back checkpoints that could not be stored, in front of newer ones, which may depend on them.
+    pub fn return_checkpoints(&self, found: Vec<Checkpoint>) {
+        let mut checkpoints = locked(&self.checkpoints);
         for checkpoint in found.into_iter().rev() {
-            findings.fresh.push_front(checkpoint);
+            checkpoints.fresh.push_front(checkpoint);
         }
     }
 
-    /// How far the mapping has come.
+    /// Progress of the mapping.
     pub fn progress(&self) -> Option<Progress> {
-        let last = locked(&self.findings).last.clone();
-        let seen = locked(&self.seen);
-        seen.now.map(|(stage, done, total)| Progress {
+        let last = locked(&self.checkpoints).last.clone();
+        let timeline = locked(&self.timeline);
+        timeline.now.map(|(stage, done, total)| Progress {
             stage: stage.as_str().to_owned(),
             done: done as u64,
             total: total as u64,
-            remaining_ms: seen.remaining_ms(last.as_ref(), Instant::now()),
+            remaining_ms: timeline.remaining_ms(last.as_ref(), Instant::now()),
         })
     }
 
-    /// What the stages took; nothing where some of the images were recalled.
+    /// Durations of the stages; `None` where some images came from checkpoints.
     pub fn pace(&self) -> Option<Pace> {
-        let seen = locked(&self.seen);
-        // No image alone makes a plant: where one is told of, boxes were read instead of a search.
-        if seen.recalled > 0 || seen.structure_recalled || seen.images < 2 {
+        let timeline = locked(&self.timeline);
+        // A plant needs two images: with one, boxes were read instead of detected.
+        if timeline.restored > 0 || timeline.structure_restored || timeline.images < 2 {
             return None;
         }
-        let ends = seen.begun.iter().skip(1).map(|(_, begun)| *begun).chain([Instant::now()]);
-        let took = seen.begun.iter().zip(ends).map(|((stage, begun), end)| {
+        let ends = timeline.begun.iter().skip(1).map(|(_, begun)| *begun).chain([Instant::now()]);
+        let took = timeline.begun.iter().zip(ends).map(|((stage, begun), end)| {
             (stage.as_str().to_owned(), end.saturating_duration_since(*begun).as_millis() as u64)
         });
-        Some(Pace { images: seen.images, stage_ms: took.collect() })
+        Some(Pace { images: timeline.images, stage_ms: took.collect() })
     }
 }
 
-impl Seen {
+impl Timeline {
     /// Milliseconds until the end: the rest of this stage by its own pace or else the last job's, the later stages by the
     /// last job's. `None` while a part of it is not known.
     fn remaining_ms(&self, last: Option<&Pace>, now: Instant) -> Option<u64> {
@@ -215,7 +214,7 @@ impl Seen {
         let spent_ms = now.saturating_duration_since(*begun).as_millis() as u64;
         let (done, total) = (done as u64, total as u64);
         let rest_ms = match stage {
-            Stage::Detect if done > self.recalled => spent_ms * total.saturating_sub(done) / (done - self.recalled),
+            Stage::Detect if done > self.restored => spent_ms * total.saturating_sub(done) / (done - self.restored),
             Stage::Detect => last?.expected_ms(stage, total.saturating_sub(done))?.saturating_sub(spent_ms),
             _ => last?.expected_ms(stage, self.images)?.saturating_sub(spent_ms),
         };
@@ -227,21 +226,21 @@ impl Seen {
 
 impl Observer for Watch {
     fn progress(&self, stage: Stage, done: usize, total: usize) {
-        let mut seen = locked(&self.seen);
+        let mut timeline = locked(&self.timeline);
         // Threads report out of order: never step back.
-        if seen.now.is_none_or(|(before, done_before, _)| (before, done_before) <= (stage, done)) {
-            seen.now = Some((stage, done, total));
+        if timeline.now.is_none_or(|(before, done_before, _)| (before, done_before) <= (stage, done)) {
+            timeline.now = Some((stage, done, total));
         }
-        if seen.begun.last().is_none_or(|(last, _)| *last < stage) {
-            seen.begun.push((stage, Instant::now()));
+        if timeline.begun.last().is_none_or(|(last, _)| *last < stage) {
+            timeline.begun.push((stage, Instant::now()));
             tracing::debug!(stage = stage.as_str(), "stage begins");
             let name = format!("stage {}", stage.as_str());
-            // The one before ends first.
-            seen.span = None;
-            seen.span = Some(tracing::info_span!(parent: &self.span, "stage", otel.name = name));
+            // The previous span ends first.
+            timeline.span = None;
+            timeline.span = Some(tracing::info_span!(parent: &self.span, "stage", otel.name = name));
         }
         if stage == Stage::Detect {
-            seen.images = total as u64;
+            timeline.images = total as u64;
         }
     }
 
@@ -250,37 +249,37 @@ impl Observer for Watch {
     }
 
     fn load_checkpoint(&self, image: &str) -> Option<Found> {
-        let found = locked(&self.findings).known.remove(image)?;
-        locked(&self.seen).recalled += 1;
+        let found = locked(&self.checkpoints).known.remove(image)?;
+        locked(&self.timeline).restored += 1;
         Some(found)
     }
 
     fn offer(&self, images: &[ImageRequest]) {
-        if self.share.get().is_some_and(|share| !share.offer(images)) {
+        if self.publisher.get().is_some_and(|publisher| !publisher.offer(images)) {
             self.stop(Stop::Lost);
         }
     }
 
     fn next(&self, left: &[usize]) -> NextImage {
-        self.share.get().map_or(NextImage::Search(left[0]), |share| share.next(left))
+        self.publisher.get().map_or(NextImage::Search(left[0]), |publisher| publisher.next(left))
     }
 
     fn save_checkpoint(&self, found: &Found) {
         let mut document = Vec::new();
         if ciborium::into_writer(found, &mut document).is_ok() {
             let name = found.detections.image.clone();
-            locked(&self.findings).fresh.push_back(Checkpoint { name, document });
+            locked(&self.checkpoints).fresh.push_back(Checkpoint { name, document });
         }
     }
 
     fn load_structure(&self, of: &str) -> Option<Fused> {
-        let parts = std::mem::take(&mut locked(&self.findings).structure);
-        // One of which parts are missing is fused again.
+        let parts = std::mem::take(&mut locked(&self.checkpoints).structure);
+        // A structure with missing parts is fused again.
         let (was_of, fused): (String, Fused) = ciborium::from_reader(parts).ok()?;
         if was_of != of {
             return None;
         }
-        locked(&self.seen).structure_recalled = true;
+        locked(&self.timeline).structure_restored = true;
         Some(fused)
     }
 
@@ -290,7 +289,7 @@ impl Observer for Watch {
             let parts = document.chunks(PART_BYTES).enumerate();
             let parts = parts
                 .map(|(part, bytes)| Checkpoint { name: format!("{STRUCTURE}{part:09}"), document: bytes.to_vec() });
-            locked(&self.findings).fresh.extend(parts);
+            locked(&self.checkpoints).fresh.extend(parts);
         }
     }
 }
@@ -315,7 +314,7 @@ mod tests {
     }
 
     #[test]
-    fn a_lost_job_is_lost() {
+    fn a_lost_lease_overrides_other_reasons_to_stop() {
         let watch = Watch::default();
         watch.stop(Stop::Cancelled);
         watch.stop(Stop::Shutdown);
@@ -325,7 +324,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_recalled_is_what_was_found_to_the_last_digit() {
+    fn checkpoints_are_exact() {
         let corner = |x: f64, y: f64| Vector2::new(100.0 + x / 3.0, 90.0 + y / 7.0);
         let detections = (0..12).map(|k| {
             let (x, y) = (f64::from(k % 6) * 61.0, f64::from(k / 6) * 151.0);
@@ -339,8 +338,8 @@ mod tests {
         let found = Found { detections, layout };
         let watch = Watch::default();
         watch.save_checkpoint(&found);
-        let (_, kept) = watch.take_found();
-        assert!(watch.take_found().1.is_empty());
+        let (_, kept) = watch.take_checkpoints();
+        assert!(watch.take_checkpoints().1.is_empty());
         let again = Watch::default();
         again.begin("f".to_owned(), kept, None);
         let recalled = again.load_checkpoint("a.jpg").unwrap();
@@ -350,7 +349,7 @@ mod tests {
     }
 
     #[test]
-    fn a_structure_is_recalled_whole_or_not_at_all() {
+    fn a_structure_is_restored_whole_or_not_at_all() {
         let bench = |rows| heliomap_mapping::fusion::Doubt {
             code: "bench_conflict".into(),
             message: "x".repeat(PART_BYTES / 2),
@@ -364,12 +363,12 @@ mod tests {
         watch.save_structure(&fused, of);
         let mut kept = Vec::new();
         loop {
-            let (_, parts) = watch.take_found();
+            let (_, parts) = watch.take_checkpoints();
             assert!(parts.len() < 2);
             if kept.len() == 1 && !parts.is_empty() {
                 // The store did not answer.
-                watch.give_back(parts);
-                kept.extend(watch.take_found().1);
+                watch.return_checkpoints(parts);
+                kept.extend(watch.take_checkpoints().1);
                 continue;
             }
             if parts.is_empty() {
@@ -395,25 +394,25 @@ mod tests {
     }
 
     #[test]
-    fn remaining_time_is_told_once_it_is_known() {
+    fn remaining_time_is_given_once_it_is_known() {
         let begun = Instant::now();
-        let mut seen = Seen {
+        let mut timeline = Timeline {
             now: Some((Stage::Detect, 4, 10)),
             begun: vec![(Stage::Read, begun), (Stage::Detect, begun)],
             images: 10,
-            recalled: 2,
-            structure_recalled: false,
+            restored: 2,
+            structure_restored: false,
             span: None,
         };
         let later = begun + Duration::from_secs(6);
-        assert_eq!(seen.remaining_ms(None, later), None);
+        assert_eq!(timeline.remaining_ms(None, later), None);
         let stage_ms = Stage::ALL.iter().map(|stage| (stage.as_str().to_owned(), 500)).collect();
         let last = Pace { images: 5, stage_ms };
         // Two images in 6 s leave 18 s for six; five later stages of 1 s each.
-        assert_eq!(seen.remaining_ms(Some(&last), later), Some(18_000 + 5_000));
-        seen.now = Some((Stage::Detect, 2, 10));
-        assert_eq!(seen.remaining_ms(Some(&last), begun), Some(800 + 5_000));
-        seen.now = Some((Stage::Assemble, 0, 1));
-        assert_eq!(seen.remaining_ms(Some(&last), later), Some(0));
+        assert_eq!(timeline.remaining_ms(Some(&last), later), Some(18_000 + 5_000));
+        timeline.now = Some((Stage::Detect, 2, 10));
+        assert_eq!(timeline.remaining_ms(Some(&last), begun), Some(800 + 5_000));
+        timeline.now = Some((Stage::Assemble, 0, 1));
+        assert_eq!(timeline.remaining_ms(Some(&last), later), Some(0));
     }
 }

@@ -1,9 +1,13 @@
-//! A worker: claims a job, maps its survey, hands in the model.
+//! A worker: claims a job, maps its survey, stores the model.
 
+use super::error::AttemptError;
 use super::folder::JobFolder;
-use super::share::Share;
+use super::helper::Helper;
+use super::mapper::Mapper;
+use super::publisher::TaskPublisher;
+use super::rows;
+use super::settings::WorkerSettings;
 use super::watch::{Stop, Watch};
-use super::{AttemptError, Mapper, rows};
 use crate::store::{Blobs, Claim, Completed, Digest, Ending, FileRecord, Heartbeat, NewModel, Store, StoreError};
 use crate::telemetry::Metrics;
 use crate::telemetry::metrics::OutcomeLabels;
@@ -18,44 +22,19 @@ use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
 
-/// A worker's times.
-#[derive(Debug, Clone, Copy)]
-pub struct WorkerSettings {
-    /// How long a silent worker keeps its job.
-    pub lease: Duration,
-    /// How often a worker reports and hears of cancellation; far below `lease`.
-    pub heartbeat: Duration,
-    /// How often an idle worker looks for work.
-    pub poll: Duration,
-    /// How long after a first failure of the environment a job is tried again, as [`Ending::Retry`] has it.
-    pub backoff: Duration,
-}
+/// How long a job that this version cannot run waits for a worker of another version, from its creation.
+const MAX_WAIT: SignedDuration = SignedDuration::from_hours(24);
 
-impl WorkerSettings {
-    /// The usual times, but for the lease.
-    pub fn with_lease(lease: Duration) -> Self {
-        Self {
-            lease,
-            heartbeat: Duration::from_secs(1).min(lease / 4),
-            poll: Duration::from_secs(1),
-            backoff: Duration::from_secs(5),
-        }
-    }
-}
-
-/// How long a job that this version cannot do waits for another, from its beginning.
-const LONGEST_WAIT: SignedDuration = SignedDuration::from_hours(24);
-
-/// How long a mapping that was told to stop may take before its job ends without it.
+/// How long a mapping may take to stop before its job ends without it.
 const LINGER: Duration = Duration::from_millis(300);
 
-/// What a job's findings depend on: its files, its options, and what looks at them.
+/// Digest of all that checkpoints depend on: files, options and mapper.
 fn fingerprint(files: &[FileRecord], options: &str, mapper: &str) -> String {
     let files: Vec<_> = files.iter().map(|file| (file.path.as_str(), file.sha256.to_string())).collect();
     Digest::of(serde_json::json!([files, options, mapper]).to_string().as_bytes()).to_string()
 }
 
-/// Runs jobs one after the other, and helps others with theirs in between.
+/// Runs jobs one after the other, and image tasks of other workers' jobs in between.
 #[derive(Clone)]
 pub struct Worker {
     pub name: String,
@@ -64,16 +43,16 @@ pub struct Worker {
     pub mapper: Arc<dyn Mapper>,
     pub settings: WorkerSettings,
     pub metrics: Metrics,
-    /// Rung when there may be work: by this process when it queues a job, and by the store.
-    pub bell: Arc<Notify>,
+    /// Notified when there may be work: by this process when it queues a job, and by the store.
+    pub work_notify: Arc<Notify>,
 }
 
 impl Worker {
-    /// Runs until `stop`; a job that is running then goes back to the queue.
+    /// Runs until `stop`; a job that is running then returns to the queue.
     pub async fn run(&self, stop: CancellationToken) {
         tracing::info!(worker = self.name, "worker started");
         tokio::select! {
-            () = self.store.ring_for_work(&self.bell) => {}
+            () = self.store.listen_for_work(&self.work_notify) => {}
             () = self.look_for_work(&stop) => {}
         }
         tracing::info!(worker = self.name, "worker stopped");
@@ -87,7 +66,7 @@ impl Worker {
                     self.work(claim, stop).instrument(span).await;
                     continue;
                 }
-                Ok(None) => match self.help(stop).await {
+                Ok(None) => match self.helper().help(stop).await {
                     Ok(0) => self.settings.poll,
                     Ok(images) => {
                         tracing::info!(images, "helped with the images of other workers' jobs");
@@ -105,13 +84,24 @@ impl Worker {
             };
             tokio::select! {
                 () = stop.cancelled() => {}
-                () = self.bell.notified() => {}
+                () = self.work_notify.notified() => {}
                 () = tokio::time::sleep(pause) => {}
             }
         }
     }
 
-    /// Runs one job to whatever end.
+    /// The part of this worker that runs image tasks of other workers' jobs.
+    fn helper(&self) -> Helper {
+        Helper {
+            store: self.store.clone(),
+            blobs: self.blobs.clone(),
+            mapper: self.mapper.clone(),
+            settings: self.settings,
+            metrics: self.metrics.clone(),
+        }
+    }
+
+    /// Runs one job and records its outcome.
     async fn work(&self, claim: Claim, stop: &CancellationToken) {
         let begun = Instant::now();
         tracing::info!(plant = %claim.job.plant, survey = %claim.job.survey, "job started");
@@ -120,13 +110,13 @@ impl Worker {
         tokio::pin!(attempt);
         let outcome = tokio::select! {
             outcome = &mut attempt => Some(outcome),
-            () = self.beat(&claim, &watch, stop) => None,
+            () = self.heartbeat_loop(&claim, &watch, stop) => None,
         };
         watch.end();
         let straggles = outcome.is_none();
         let outcome = outcome.unwrap_or(Err(MapError::Cancelled.into()));
-        if let Err(error) = self.settle(&claim, &watch, outcome).await {
-            // The lease runs out and the job is taken up again.
+        if let Err(error) = self.record_outcome(&claim, &watch, outcome).await {
+            // The lease expires and the job is claimed again.
             tracing::error!(%error, "cannot record the end of the job");
         }
         if straggles && !stop.is_cancelled() {
@@ -136,24 +126,24 @@ impl Worker {
         tracing::info!(seconds = begun.elapsed().as_secs_f64(), "job left");
     }
 
-    /// Reports and keeps what was found, for as long as it is polled, or until the attempt was told to stop and did not
-    /// within a moment.
-    async fn beat(&self, claim: &Claim, watch: &Watch, stop: &CancellationToken) {
-        let mut heard = Instant::now();
-        let mut told = false;
+    /// Extends the lease and stores checkpoints for as long as it is polled. Returns where the attempt was ordered to stop and
+    /// did not within [`LINGER`].
+    async fn heartbeat_loop(&self, claim: &Claim, watch: &Watch, stop: &CancellationToken) {
+        let mut last_answer = Instant::now();
+        let mut stopping = false;
         loop {
-            let pause = if told { LINGER } else { self.settings.heartbeat };
+            let pause = if stopping { LINGER } else { self.settings.heartbeat };
             tokio::select! {
                 () = tokio::time::sleep(pause) => {}
                 () = stop.cancelled(), if watch.stopped().is_none() => watch.stop(Stop::Shutdown),
             }
-            self.keep(claim, watch).await;
+            self.store_checkpoints(claim, watch).await;
             let heartbeat = self.store.heartbeat(claim, watch.progress(), self.settings.lease, Timestamp::now());
-            // Who is cut off gets no answer, not even that.
+            // Without a network there may be no answer at all, not even an error.
             let answer = tokio::time::timeout(self.settings.lease, heartbeat).await;
             match answer.unwrap_or(Err(StoreError::Silent)) {
                 Ok(answer) => {
-                    heard = Instant::now();
+                    last_answer = Instant::now();
                     match answer {
                         Heartbeat::Continue => {}
                         Heartbeat::Cancel => watch.stop(Stop::Cancelled),
@@ -162,52 +152,54 @@ impl Worker {
                 }
                 Err(error) => {
                     tracing::warn!(%error, "heartbeat failed");
-                    if heard.elapsed() > self.settings.lease {
+                    let is_upgraded = matches!(error, StoreError::NewerSchema { .. });
+                    if is_upgraded || last_answer.elapsed() > self.settings.lease {
                         watch.stop(Stop::Lost);
                     }
                 }
             }
             if watch.stopped().is_some() {
-                if told {
+                if stopping {
                     return;
                 }
-                told = true;
+                stopping = true;
             }
         }
     }
 
-    /// Holds on to a job whose model is being stored, however long that takes; comes back where the job was cancelled.
+    /// Keeps the lease of a job whose model is being stored, however long that takes; returns where the job was cancelled.
     async fn hold_until_cancelled(&self, claim: &Claim, watch: &Watch) {
         loop {
             tokio::time::sleep(self.settings.heartbeat).await;
             match self.store.heartbeat(claim, watch.progress(), self.settings.lease, Timestamp::now()).await {
                 Ok(Heartbeat::Continue) => {}
                 Ok(Heartbeat::Cancel) => return,
-                // Whether that is because the model is stored, its storing tells.
+                // Either the model is stored now or the lease is lost: storing it returns which.
                 Ok(Heartbeat::Lost) => std::future::pending().await,
                 Err(error) => tracing::warn!(%error, "heartbeat failed"),
             }
         }
     }
 
-    /// Stores what was found since the last time. What cannot be stored now is tried again the next time.
-    async fn keep(&self, claim: &Claim, watch: &Watch) {
-        let (fingerprint, found) = watch.take_found();
+    /// Stores new checkpoints; those that cannot be stored are kept for the next time.
+    async fn store_checkpoints(&self, claim: &Claim, watch: &Watch) {
+        let (fingerprint, found) = watch.take_checkpoints();
         if found.is_empty() {
             return;
         }
-        let kept = tokio::time::timeout(self.settings.lease, self.store.checkpoint(claim, &fingerprint, &found)).await;
-        match kept.unwrap_or(Err(StoreError::Silent)) {
+        let stored =
+            tokio::time::timeout(self.settings.lease, self.store.checkpoint(claim, &fingerprint, &found)).await;
+        match stored.unwrap_or(Err(StoreError::Silent)) {
             Ok(true) => {}
             Ok(false) => watch.stop(Stop::Lost),
             Err(error) => {
-                tracing::warn!(%error, "what was found so far cannot be kept now");
-                watch.give_back(found);
+                tracing::warn!(%error, "cannot store checkpoints; trying again with the next heartbeat");
+                watch.return_checkpoints(found);
             }
         }
     }
 
-    /// Maps the survey and stores the model's bytes; the rows are left to [`Self::settle`].
+    /// Maps the survey and stores the model's bytes; the rows are left to [`Self::record_outcome`].
     async fn attempt(&self, claim: &Claim, watch: &Arc<Watch>) -> Result<NewModel, AttemptError> {
         let job = &claim.job;
         let options: MapOptions = serde_json::from_str(&job.options).map_err(AttemptError::Options)?;
@@ -231,17 +223,17 @@ impl Worker {
         let fingerprint = fingerprint(&files, &job.options, &identity);
         let known = self.store.checkpoints(job.id, &fingerprint).await?;
         if !known.is_empty() {
-            tracing::info!(findings = known.len(), "the job goes on where it was");
+            tracing::info!(checkpoints = known.len(), "resuming from checkpoints");
         }
         let pace = self.store.last_stage_ms().await?;
         watch.begin(fingerprint.clone(), known, pace.and_then(|text| serde_json::from_str(&text).ok()));
         let folder = JobFolder::lay_out(&self.blobs, job.plant, &files).await?;
-        watch.share(Share {
+        watch.publish_by(TaskPublisher {
             store: self.store.clone(),
             claim: claim.clone(),
             fingerprint,
             mapper: identity,
-            digests: Share::digests(&files),
+            digests: TaskPublisher::digests(&files),
             folder: folder.path().to_owned(),
             runtime: Handle::current(),
             state: Mutex::default(),
@@ -251,7 +243,7 @@ impl Worker {
         let span = tracing::Span::current();
         let mapping = tokio::task::spawn_blocking(move || {
             let _entered = span.enter();
-            let mut model = mapper.map(&folder, &options, &subject, &*observer)?;
+            let mut model = mapper.run(&folder, &options, &subject, &*observer)?;
             model.version = version;
             let bytes = serde_json::to_vec(&model).map_err(std::io::Error::from)?;
             let layers = rows::layers(&model);
@@ -260,7 +252,7 @@ impl Worker {
         let (bytes, layers, warnings) = mapping.await.map_err(|_| AttemptError::Panicked)??;
         let (sha256, size) = (Digest::of(&bytes), bytes.len() as u64);
         tracing::debug!(bytes = size, "storing the model begins");
-        // Where the job does not come to its end, the model is one of the blobs that nothing names.
+        // Where the job does not complete, the model is an unused blob and is deleted later.
         self.store.reserve_model(job.plant, (sha256, size), Timestamp::now()).await?;
         self.blobs.put_bytes(job.plant, bytes).await?;
         let pace = watch.pace();
@@ -272,7 +264,7 @@ impl Worker {
     }
 
     /// Records how an attempt ended.
-    async fn settle(
+    async fn record_outcome(
         &self,
         claim: &Claim,
         watch: &Watch,
@@ -280,11 +272,11 @@ impl Worker {
     ) -> Result<(), StoreError> {
         let now = Timestamp::now();
         if outcome.is_err() {
-            self.keep(claim, watch).await;
+            self.store_checkpoints(claim, watch).await;
         }
         let ending = match (outcome, watch.stopped()) {
             (_, Some(Stop::Lost)) => {
-                tracing::warn!("the job is in other hands or gone; its result is dropped");
+                tracing::warn!("lease lost; discarding result");
                 return Ok(());
             }
             (Ok(model), _) => {
@@ -301,12 +293,12 @@ impl Worker {
                         return Ok(());
                     }
                     Some(Completed::Fenced) => {
-                        tracing::warn!("the job is in other hands or gone; its result is dropped");
+                        tracing::warn!("lease lost; discarding result");
                         return Ok(());
                     }
                     Some(Completed::Outdated) => Ending::Retry {
                         code: "outdated".to_owned(),
-                        message: "the plant got another model meanwhile; the survey is mapped again".to_owned(),
+                        message: "the plant got another model meanwhile; the survey will be mapped again".to_owned(),
                         backoff: Duration::ZERO,
                     },
                 }
@@ -324,7 +316,7 @@ impl Worker {
             Ending::Released => "released",
         });
         if !self.store.end_job(claim, &ending, now).await? {
-            tracing::warn!("the job is in other hands or gone");
+            tracing::warn!("lease lost; the end of the job is not recorded");
         }
         Ok(())
     }
@@ -333,7 +325,7 @@ impl Worker {
         self.metrics.attempts.get_or_create(&OutcomeLabels { outcome }).inc();
     }
 
-    /// What is said of an error, and whether the job is tried again.
+    /// How a job ends after an error: its code and message, and whether it is retried.
     fn ending(&self, error: AttemptError, created: Timestamp) -> Ending {
         let retry = |code: &str, message: String| Ending::Retry {
             code: code.to_owned(),
@@ -342,7 +334,7 @@ impl Worker {
         };
         let internal = || Ending::Failed {
             code: "internal_error".to_owned(),
-            message: "the mapping failed for a reason that is a fault of this program; its log says more".to_owned(),
+            message: "the mapping failed because of a fault in this program; see the log of the service".to_owned(),
         };
         match error {
             AttemptError::Map(MapError::Input { code, message }) => Ending::Failed { code: code.to_owned(), message },
@@ -352,16 +344,16 @@ impl Worker {
             }
             AttemptError::Store(_) | AttemptError::Folder(_) => {
                 tracing::error!(%error, "the environment failed");
-                retry("environment", "the service's storage failed; its log says more".to_owned())
+                retry("environment", "the service's storage failed; see the log of the service".to_owned())
             }
             AttemptError::Options(_) | AttemptError::PreviousModel { .. } => {
-                tracing::warn!(%error, "a worker of another version has to do it");
+                tracing::warn!(%error, "this job needs a worker of another version");
                 let code = "another_version".to_owned();
-                if created.duration_until(Timestamp::now()) > LONGEST_WAIT {
-                    let message = format!("{error}, and for a day no worker of the version that wrote that was there");
+                if created.duration_until(Timestamp::now()) > MAX_WAIT {
+                    let message = format!("{error}, and no worker of the version that wrote it came within a day");
                     return Ending::Failed { code, message };
                 }
-                let message = format!("{error}: the job waits for a worker of the version that wrote that");
+                let message = format!("{error}: the job waits for a worker of the version that wrote it");
                 Ending::Declined { code, message, pause: self.settings.backoff }
             }
             AttemptError::Map(MapError::Cancelled) | AttemptError::Panicked => {
@@ -380,7 +372,7 @@ mod tests {
     fn a_cancelled_job_ends_within_two_seconds_whatever_the_lease() {
         for lease_s in [1, 30, 3600] {
             let settings = WorkerSettings::with_lease(Duration::from_secs(lease_s));
-            // It is heard of at the next heartbeat, and a mapping that does not listen is left a moment later.
+            // The worker notices at the next heartbeat, and leaves a mapping that does not stop a moment later.
             let latest = settings.heartbeat + LINGER;
             assert!(latest <= Duration::from_millis(1500), "{latest:?} with a lease of {lease_s} s");
         }

@@ -1,4 +1,4 @@
-//! The signatures of tokens, checked by *ring*. Nothing is signed here.
+//! Verifies the signatures of tokens with *ring*. Nothing is signed here.
 
 use jsonwebtoken::crypto::{CryptoProvider, JwtSigner, JwtVerifier, KeyUtils};
 use jsonwebtoken::errors::{Error, ErrorKind};
@@ -11,9 +11,9 @@ use ring::signature::{
 static PROVIDER: CryptoProvider =
     CryptoProvider { signer_factory: no_signer, verifier_factory: verifier, key_utils: KeyUtils::new_unimplemented() };
 
-/// Makes *ring* check the tokens of this process. May be called more than once.
+/// Installs *ring* as the verifier of this process's tokens. May be called more than once.
 pub fn provide() {
-    // An error says that it does already.
+    // An error means that it is installed already.
     let _ = PROVIDER.install_default();
 }
 

@@ -1,5 +1,5 @@
-//! The provider's public keys: found by its discovery document, kept, and fetched again when a token names one that is not
-//! known, within bounds, since anyone may send such a token.
+//! The provider's public keys: found by its discovery document, cached, and fetched again when a token names an unknown key.
+//! Fetches are rate-limited, since anyone may send such a token.
 
 use jsonwebtoken::jwk::{AlgorithmParameters, EllipticCurve, Jwk, PublicKeyUse};
 use jsonwebtoken::{Algorithm, DecodingKey};
@@ -10,23 +10,23 @@ use std::sync::{Arc, PoisonError, RwLock};
 use std::time::{Duration, Instant};
 use tokio::sync::Mutex;
 
-/// How long keys are kept without asking whether they still hold.
+/// Age up to which keys are used without a new fetch.
 const FRESH: Duration = Duration::from_secs(3600);
-/// How long keys hold of which the provider cannot be asked.
+/// Age up to which keys are used while the provider does not answer.
 const MAX_AGE: Duration = Duration::from_secs(24 * 3600);
-/// How long a fetch may take.
+/// Time limit of a fetch.
 const TIMEOUT: Duration = Duration::from_secs(5);
-/// Largest answer of the provider, bytes.
+/// Maximum size of an answer of the provider, bytes.
 const MAX_BYTES: usize = 256 << 10;
-/// Most keys that are kept.
+/// Maximum number of keys.
 const MAX_KEYS: usize = 100;
 
 /// Why there are no keys.
 #[derive(Debug, Clone, thiserror::Error)]
 pub enum KeyError {
-    #[error("{url} is no URL to fetch keys from: it must begin with https://, or name this machine")]
+    #[error("cannot fetch keys from {url}: the URL must begin with https://, or name this machine")]
     Url { url: String },
-    #[error("no requests can be sent: {0}; install the certificates of public authorities")]
+    #[error("cannot send requests: {0}; install the certificates of public authorities")]
     Client(String),
     #[error("{url}: {what}")]
     Fetch { url: String, what: String },
@@ -54,18 +54,18 @@ struct Kept {
 /// How old keys may be.
 #[derive(Debug, Clone, Copy)]
 pub struct Ages {
-    /// The least time between two fetches.
+    /// Minimum time between two fetches.
     pub min_refresh: Duration,
-    /// For so long nobody is asked whether they still hold.
+    /// Age up to which keys are used without a new fetch.
     pub fresh: Duration,
-    /// So old they hold no more.
-    pub most: Duration,
+    /// Age from which keys are not used.
+    pub max: Duration,
 }
 
 impl Ages {
-    /// The usual ones, but for the least time between two fetches.
+    /// Default ages, with a minimum time between two fetches.
     pub fn with_min_refresh(min_refresh: Duration) -> Self {
-        Self { min_refresh, fresh: FRESH, most: MAX_AGE }
+        Self { min_refresh, fresh: FRESH, max: MAX_AGE }
     }
 }
 
@@ -76,7 +76,7 @@ pub struct Keys {
     discovery: Url,
     client: Client,
     ages: Ages,
-    /// Held by whoever fetches.
+    /// Held during a fetch.
     turn: Mutex<()>,
     kept: RwLock<Arc<Kept>>,
 }
@@ -87,7 +87,7 @@ impl Kept {
     }
 }
 
-/// What the discovery document tells (OpenID Connect Discovery 1.0, section 3).
+/// The discovery document (OpenID Connect Discovery 1.0, section 3).
 #[derive(Deserialize)]
 struct Discovery {
     issuer: String,
@@ -100,7 +100,7 @@ struct KeySet {
 }
 
 impl Keys {
-    /// The keys of an issuer, which is not asked yet.
+    /// The keys of an issuer; nothing is fetched yet.
     pub fn new(issuer: &str, ages: Ages) -> Result<Self, KeyError> {
         let discovery = checked(&format!("{}/.well-known/openid-configuration", issuer.trim_end_matches('/')))?;
         crate::tls::provide();
@@ -110,15 +110,15 @@ impl Keys {
         Ok(Self { issuer: issuer.to_owned(), discovery, client, ages, turn, kept })
     }
 
-    /// The key of this identifier for this algorithm; without an identifier, the only one for the algorithm. One that is
-    /// known keeps nobody waiting: whether it still holds is asked beside.
+    /// The key of this identifier for this algorithm; without an identifier, the only key for the algorithm. A cached key is
+    /// returned at once; where it is not fresh, keys are fetched in the background.
     pub async fn key(
         self: &Arc<Self>,
         id: Option<&str>,
         algorithm: Algorithm,
     ) -> Result<Option<DecodingKey>, KeyError> {
         let known = self.kept();
-        if let Some(key) = pick(&known.keys, id, algorithm).filter(|_| known.is_younger(self.ages.most)) {
+        if let Some(key) = pick(&known.keys, id, algorithm).filter(|_| known.is_younger(self.ages.max)) {
             let asked = self.turn.try_lock().is_err() || self.tried_lately(&known);
             if !known.is_younger(self.ages.fresh) && !asked {
                 let keys = self.clone();
@@ -126,10 +126,10 @@ impl Keys {
             }
             return Ok(Some(key));
         }
-        // Whoever comes while keys are being fetched waits for them.
+        // Concurrent callers wait for the same fetch.
         self.refresh_unless_lately().await;
         let known = self.kept();
-        let holds = known.is_younger(self.ages.most);
+        let holds = known.is_younger(self.ages.max);
         match &known.failure {
             Some(failure) if !holds => Err(failure.clone()),
             _ => Ok(pick(&known.keys, id, algorithm).filter(|_| holds)),
@@ -143,7 +143,7 @@ impl Keys {
     async fn refresh_unless_lately(&self) {
         let _turn = self.turn.lock().await;
         if !self.tried_lately(&self.kept()) {
-            // Why it failed is kept.
+            // The reason of a failure is kept in `failure`.
             let _ = self.refresh().await;
         }
     }
@@ -173,11 +173,11 @@ impl Keys {
     async fn fetch(&self) -> Result<Vec<Known>, KeyError> {
         let discovery: Discovery = self.get(self.discovery.clone()).await?;
         if discovery.issuer != self.issuer {
-            let what = format!("it is of the issuer `{}` and not of `{}`", discovery.issuer, self.issuer);
+            let what = format!("its issuer is `{}`, not `{}`", discovery.issuer, self.issuer);
             return Err(KeyError::Fetch { url: self.discovery.to_string(), what });
         }
         let set: KeySet = self.get(checked(&discovery.jwks_uri)?).await?;
-        // What is for something else, or unknown here, is passed over.
+        // Keys for other purposes or of unknown kinds are skipped.
         let keys = set.keys.into_iter().take(MAX_KEYS).filter_map(|key| known(serde_json::from_value(key).ok()?));
         Ok(keys.collect())
     }
@@ -185,13 +185,13 @@ impl Keys {
     /// A JSON document.
     async fn get<T: serde::de::DeserializeOwned>(&self, url: Url) -> Result<T, KeyError> {
         let failed = |what: String| KeyError::Fetch { url: url.to_string(), what };
-        let told = |error: reqwest::Error| failed(error.without_url().to_string());
-        let mut answer = self.client.get(url.clone()).send().await.map_err(told)?;
+        let unsent = |error: reqwest::Error| failed(error.without_url().to_string());
+        let mut answer = self.client.get(url.clone()).send().await.map_err(unsent)?;
         if !answer.status().is_success() {
             return Err(failed(format!("it answered {}", answer.status())));
         }
         let mut body = Vec::new();
-        while let Some(chunk) = answer.chunk().await.map_err(told)? {
+        while let Some(chunk) = answer.chunk().await.map_err(unsent)? {
             body.extend_from_slice(&chunk);
             if body.len() > MAX_BYTES {
                 return Err(failed(format!("it answered more than {MAX_BYTES} bytes")));
@@ -201,7 +201,7 @@ impl Keys {
     }
 }
 
-/// A URL that keys may be fetched from: nobody in between may change them.
+/// A URL that keys may be fetched from: encrypted, or on this machine.
 fn checked(text: &str) -> Result<Url, KeyError> {
     let url = Url::parse(text).map_err(|_| KeyError::Url { url: text.to_owned() })?;
     let here = matches!(url.host_str(), Some("127.0.0.1" | "[::1]" | "localhost"));
@@ -212,7 +212,7 @@ fn checked(text: &str) -> Result<Url, KeyError> {
     }
 }
 
-/// A key that signs tokens by one of the algorithms that are taken.
+/// A key for signatures by one of the accepted algorithms.
 fn known(jwk: Jwk) -> Option<Known> {
     let algorithm = match &jwk.algorithm {
         AlgorithmParameters::RSA(_) => Algorithm::RS256,
@@ -221,8 +221,8 @@ fn known(jwk: Jwk) -> Option<Known> {
         _ => return None,
     };
     let signs = jwk.common.public_key_use.as_ref().is_none_or(|usage| *usage == PublicKeyUse::Signature);
-    let said = jwk.common.key_algorithm.map(|said| said.to_string());
-    let fits = said.is_none_or(|said| said == format!("{algorithm:?}"));
+    let stated = jwk.common.key_algorithm.map(|stated| stated.to_string());
+    let fits = stated.is_none_or(|stated| stated == format!("{algorithm:?}"));
     let key = DecodingKey::from_jwk(&jwk).ok()?;
     (signs && fits).then_some(Known { id: jwk.common.key_id, algorithm, key })
 }

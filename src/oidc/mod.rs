@@ -1,5 +1,5 @@
-//! Tokens of an identity provider (OpenID Connect): who shows one that the provider signed for this service is let in as its
-//! claims say.
+//! Tokens of an identity provider (OpenID Connect): a token that the provider signed for this service grants what its claims
+//! state.
 
 pub mod keys;
 
@@ -12,24 +12,24 @@ use serde_json::Value;
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-/// Longest token, bytes.
+/// Maximum size of a token, bytes.
 const MAX_TOKEN_BYTES: usize = 16 << 10;
-/// By how much the clocks of provider and service may differ, seconds.
+/// Tolerated difference between the clocks of provider and service, seconds.
 const LEEWAY_S: u64 = 30;
-/// Signatures that are taken: what can be checked by a public key, and nothing older.
+/// Accepted algorithms: current ones with public keys.
 const ALGORITHMS: [Algorithm; 3] = [Algorithm::RS256, Algorithm::ES256, Algorithm::EdDSA];
 
-/// Whose tokens are taken, and what their claims mean.
+/// Whose tokens are accepted, and what their claims mean.
 #[derive(Debug, Clone)]
 pub struct OidcSettings {
     /// The provider's `issuer`, to the letter.
     pub issuer: String,
-    /// What must stand in `aud`.
+    /// The required `aud`.
     pub audience: String,
     pub organisation: OrganisationRule,
-    /// The claim that holds what the caller may do: words, or a list of them.
+    /// The claim that grants scopes: words, or a list of them.
     pub scope_claim: String,
-    /// What a word of that claim stands for.
+    /// The scope that a word of that claim grants.
     pub scopes: Vec<(String, Scope)>,
     /// How old the provider's keys may be.
     pub ages: Ages,
@@ -44,7 +44,7 @@ pub enum OrganisationRule {
     Claim(String),
 }
 
-/// Who showed a token.
+/// The caller that presented a token.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Bearer {
     /// The claim `sub`.
@@ -54,14 +54,14 @@ pub struct Bearer {
     pub scopes: BTreeSet<Scope>,
 }
 
-/// Why a token lets nobody in.
+/// Why a token is refused.
 #[derive(Debug, thiserror::Error)]
 pub enum OidcError {
-    /// Whoever shows it needs another.
+    /// The token is not valid.
     #[error("the token {0}")]
     Refused(String),
-    /// It cannot be checked now.
-    #[error("the keys of the identity provider cannot be fetched: {0}")]
+    /// The token cannot be checked now.
+    #[error("cannot fetch the keys of the identity provider: {0}")]
     Unavailable(#[from] KeyError),
 }
 
@@ -77,20 +77,20 @@ pub struct Oidc {
 }
 
 impl Oidc {
-    /// One that takes tokens by these settings. The provider is asked for its keys when the first token comes.
+    /// A checker with these settings. The provider's keys are fetched when the first token comes.
     ///
     /// # Errors
-    /// Where the issuer is no URL that keys may be fetched from, or the system gives no certificates to check it by.
+    /// An issuer that keys may not be fetched from, or no certificates of authorities on this system.
     pub fn new(settings: OidcSettings) -> Result<Self, KeyError> {
         crypto::provide();
         let keys = Arc::new(Keys::new(&settings.issuer, settings.ages)?);
         Ok(Self { settings, keys })
     }
 
-    /// Who showed this token.
+    /// The caller that this token identifies.
     ///
     /// # Errors
-    /// Where it is not one that the provider signed for this service and that holds now.
+    /// A token that the provider did not sign for this service, or that is not valid now.
     pub async fn bearer(&self, token: &str) -> Result<Bearer, OidcError> {
         if token.len() > MAX_TOKEN_BYTES {
             return Err(refused("is longer than 16 KiB"));
@@ -100,7 +100,7 @@ impl Oidc {
             return Err(refused("is not signed by RS256, ES256 or EdDSA"));
         }
         let key = self.keys.key(header.kid.as_deref(), header.alg).await?;
-        let key = key.ok_or_else(|| refused("is signed by a key that the provider does not have"))?;
+        let key = key.ok_or_else(|| refused("is signed by a key that the provider does not publish"))?;
         let mut validation = Validation::new(header.alg);
         validation.leeway = LEEWAY_S;
         validation.validate_nbf = true;
@@ -111,18 +111,18 @@ impl Oidc {
             use jsonwebtoken::errors::ErrorKind;
             refused(match error.kind() {
                 ErrorKind::ExpiredSignature => "has expired".to_owned(),
-                ErrorKind::ImmatureSignature => "does not hold yet".to_owned(),
+                ErrorKind::ImmatureSignature => "is not valid yet".to_owned(),
                 ErrorKind::InvalidIssuer => format!("is not of {}", self.settings.issuer),
                 ErrorKind::InvalidAudience => format!("is not for {}", self.settings.audience),
                 ErrorKind::MissingRequiredClaim(claim) => format!("lacks the claim {claim}"),
-                _ => "has a signature that does not hold".to_owned(),
+                _ => "has an invalid signature".to_owned(),
             })
         })?;
-        self.told(&decoded.claims)
+        self.read_claims(&decoded.claims)
     }
 
-    /// What the claims of a token say.
-    fn told(&self, claims: &Value) -> Result<Bearer, OidcError> {
+    /// The caller that claims describe.
+    fn read_claims(&self, claims: &Value) -> Result<Bearer, OidcError> {
         let subject = claims["sub"].as_str().filter(|subject| is_name(subject));
         let subject = subject.ok_or_else(|| refused("names no subject in `sub`"))?;
         let organisation = match &self.settings.organisation {
@@ -145,21 +145,21 @@ impl Oidc {
         })
     }
 
-    /// Fetches the provider's keys; how many there are.
+    /// Fetches the provider's keys and returns their number.
     ///
     /// # Errors
-    /// Where they cannot be fetched.
+    /// Keys that cannot be fetched.
     pub async fn fetch(&self) -> Result<usize, KeyError> {
         self.keys.refresh().await
     }
 
-    /// What the provider is called.
+    /// The issuer.
     pub fn issuer(&self) -> &str {
         &self.settings.issuer
     }
 }
 
-/// Whether a text may be a name in the log: not empty, not endless, on one line.
+/// Whether a text may be a name in the log: one line of 1 to 200 characters.
 fn is_name(text: &str) -> bool {
     (1..=200).contains(&text.chars().count()) && !text.chars().any(char::is_control)
 }
@@ -188,23 +188,24 @@ mod tests {
     }
 
     #[test]
-    fn claims_say_who_one_is_and_what_one_may() {
+    fn claims_identify_the_caller_and_grant_scopes() {
         let by_claim = oidc(OrganisationRule::Claim("org".to_owned()), "realm.roles");
-        let told =
-            by_claim.told(&json!({"sub": "7", "org": "sun", "realm": {"roles": ["pilots", "others", 3]}})).unwrap();
-        assert_eq!((told.subject.as_str(), told.organisation.as_str()), ("7", "sun"));
-        assert_eq!(told.scopes, BTreeSet::from([Scope::Upload]));
+        let bearer = by_claim
+            .read_claims(&json!({"sub": "7", "org": "sun", "realm": {"roles": ["pilots", "others", 3]}}))
+            .unwrap();
+        assert_eq!((bearer.subject.as_str(), bearer.organisation.as_str()), ("7", "sun"));
+        assert_eq!(bearer.scopes, BTreeSet::from([Scope::Upload]));
         let fixed = oidc(OrganisationRule::Named("sun".to_owned()), "scope");
-        let told = fixed.told(&json!({"sub": "7", "scope": "openid pilots plant-admins"})).unwrap();
-        assert_eq!(told.scopes, BTreeSet::from([Scope::Upload, Scope::Admin]));
-        assert!(fixed.told(&json!({"sub": "7", "scope": "pilot"})).unwrap().scopes.is_empty());
+        let bearer = fixed.read_claims(&json!({"sub": "7", "scope": "openid pilots plant-admins"})).unwrap();
+        assert_eq!(bearer.scopes, BTreeSet::from([Scope::Upload, Scope::Admin]));
+        assert!(fixed.read_claims(&json!({"sub": "7", "scope": "pilot"})).unwrap().scopes.is_empty());
         for wrong in [
             json!({"sub": "7"}),
             json!({"sub": "7", "org": ""}),
             json!({"sub": "7", "org": "a\nb"}),
             json!({"org": "sun"}),
         ] {
-            assert!(by_claim.told(&wrong).is_err(), "{wrong}");
+            assert!(by_claim.read_claims(&wrong).is_err(), "{wrong}");
         }
     }
 }

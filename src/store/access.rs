@@ -1,29 +1,16 @@
-//! Who may do what: organisations, their keys, and the log of what was done.
+//! Organisations, their keys, and the audit log.
 
-use super::records::row_id;
-use super::{Created, Digest, Page, StoreError, TimeSpan};
+use super::digest::Digest;
+use super::error::StoreError;
+use super::ids::{KeyId, OrganisationId};
+use super::listing::{Created, Page, TimeSpan};
 use heliomap_model::PlantId;
 use jiff::Timestamp;
 use std::collections::BTreeSet;
 use std::fmt;
 use std::str::FromStr;
-use uuid::Uuid;
 
-row_id!(
-    /// Identifies an organisation: who owns plants and keys.
-    OrganisationId
-);
-row_id!(
-    /// Identifies a key, whatever its secret is at the moment.
-    KeyId
-);
-
-impl OrganisationId {
-    /// The organisation that is always there.
-    pub const DEFAULT: Self = Self(Uuid::nil());
-}
-
-/// What a key is good for.
+/// What a key permits.
 #[derive(
     Debug,
     Clone,
@@ -79,7 +66,7 @@ impl FromStr for Scope {
     }
 }
 
-/// Who owns plants and keys. Organisations never see each other's.
+/// An owner of plants and keys. Organisations never see each other's.
 #[derive(Debug, Clone)]
 pub struct Organisation {
     pub id: OrganisationId,
@@ -94,10 +81,10 @@ pub struct ApiKey {
     pub id: KeyId,
     pub organisation: OrganisationId,
     pub name: String,
-    /// How its secret begins, for people to know it by.
+    /// The beginning of its secret, by which people recognise it.
     pub prefix: String,
     pub scopes: BTreeSet<Scope>,
-    /// The plants that it is good for; all of the organisation's where there is no list.
+    /// The plants that it gives access to; `None` for all of the organisation's.
     pub plants: Option<Vec<PlantId>>,
     pub created: Timestamp,
     pub expires: Option<Timestamp>,
@@ -106,7 +93,7 @@ pub struct ApiKey {
     pub last_used: Option<Timestamp>,
 }
 
-/// What is kept of a secret.
+/// What is stored of a secret.
 #[derive(Debug, Clone)]
 pub struct SecretRecord {
     pub sha256: Digest,
@@ -124,14 +111,14 @@ pub struct NewKey {
     pub expires: Option<Timestamp>,
 }
 
-/// Something that was done, or tried.
+/// A request that changed something, or tried to.
 #[derive(Debug, Clone)]
 pub struct AuditEntry {
     pub organisation: OrganisationId,
     pub at: Timestamp,
-    /// The key that it was done with, and what that was called; none where it was done without one.
+    /// Identifier and name of the key that was used.
     pub key: Option<(KeyId, String)>,
-    /// Whose token it was done with.
+    /// The subject of the token that was used.
     pub subject: Option<String>,
     pub method: String,
     pub path: String,
@@ -143,7 +130,7 @@ pub struct AuditEntry {
 /// Organisations, keys and the audit log.
 #[async_trait::async_trait]
 pub trait AccessStore: Send + Sync + 'static {
-    /// Creates an organisation, or finds the one of that name.
+    /// Creates an organisation, or returns the existing one of that name.
     async fn create_organisation(&self, name: &str, now: Timestamp) -> Result<Created<Organisation>, StoreError>;
 
     /// The organisation of a name.
@@ -151,19 +138,19 @@ pub trait AccessStore: Send + Sync + 'static {
 
     /// Stores a key.
     async fn create_key(&self, key: &NewKey, now: Timestamp) -> Result<ApiKey, StoreError>;
-    /// One key of an organisation, revoked and expired ones included.
+    /// One key of an organisation, even if revoked or expired.
     async fn key(&self, organisation: OrganisationId, id: KeyId) -> Result<Option<ApiKey>, StoreError>;
-    /// An organisation's keys, or everyone's, that were made within a time, in the order of their creation, revoked and
-    /// expired ones included.
+    /// Keys of one organisation or of all that were created within a time span, in order of creation, including revoked and
+    /// expired ones.
     async fn keys(
         &self,
         organisation: Option<OrganisationId>,
         made: TimeSpan,
         page: Page,
     ) -> Result<Vec<ApiKey>, StoreError>;
-    /// The key with this secret that is good now.
+    /// The key with this secret that is valid now.
     async fn key_of_secret(&self, sha256: Digest, now: Timestamp) -> Result<Option<ApiKey>, StoreError>;
-    /// Makes a key good for nothing, for ever; where it is said, only while its secret is the one that begins so.
+    /// Revokes a key; where `prefix` is given, only while its secret begins so.
     async fn revoke_key(
         &self,
         organisation: OrganisationId,
@@ -171,8 +158,8 @@ pub trait AccessStore: Send + Sync + 'static {
         prefix: Option<&str>,
         now: Timestamp,
     ) -> Result<Option<ApiKey>, StoreError>;
-    /// Gives a key that is not revoked a new secret, where it is said only while its secret is the one that begins so; the
-    /// one before stays good until a time.
+    /// Gives a key that is not revoked a new secret; where `prefix` is given, only while its secret begins so. The previous
+    /// secret stays valid until `previous_until`.
     async fn rotate_key(
         &self,
         organisation: OrganisationId,
@@ -181,14 +168,14 @@ pub trait AccessStore: Send + Sync + 'static {
         secret: &SecretRecord,
         previous_until: Timestamp,
     ) -> Result<Option<ApiKey>, StoreError>;
-    /// Notes that a key was used.
+    /// Records that a key was used.
     async fn key_used(&self, id: KeyId, now: Timestamp) -> Result<(), StoreError>;
 
     /// Adds to the audit log.
     async fn record(&self, entry: &AuditEntry) -> Result<(), StoreError>;
-    /// Forgets what the audit log holds of before a time.
+    /// Deletes entries of the audit log from before a time.
     async fn forget_audit(&self, before: Timestamp) -> Result<(), StoreError>;
-    /// An organisation's audit log of a time, the newest first, each entry with its sequence number.
+    /// An organisation's audit log within a time span, newest first, each entry with its sequence number.
     async fn audit(
         &self,
         organisation: OrganisationId,

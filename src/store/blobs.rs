@@ -1,7 +1,11 @@
-//! Bytes: content-addressed within a plant, so that what is stored once is never half-written, a plant's deletion
-//! deletes everything of it, and nobody learns from an upload what another plant holds.
+//! Bytes, addressed by their content within a plant: a blob is never half-written, deleting a plant deletes all its blobs, and an
+//! upload reveals nothing about the contents of other plants.
 
-use super::{Bucket, StoreError, UploadId, pieces};
+use super::bucket::Bucket;
+use super::digest::Digest;
+use super::error::StoreError;
+use super::ids::UploadId;
+use super::server_id::server_id;
 use futures::TryStreamExt;
 use heliomap_model::PlantId;
 use object_store::aws::AmazonS3Builder;
@@ -10,11 +14,8 @@ use object_store::local::LocalFileSystem;
 use object_store::path::Path as Key;
 use object_store::{ObjectStore, ObjectStoreExt};
 use sha2::Digest as _;
-use std::collections::HashSet;
-use std::fmt;
-use std::io::{BufRead, BufReader, Write};
+use std::io::Write;
 use std::path::{Path, PathBuf};
-use std::str::FromStr;
 use std::sync::Arc;
 use std::time::Duration;
 use tempfile::TempPath;
@@ -23,63 +24,14 @@ use tokio::sync::Semaphore;
 use tokio_util::io::ReaderStream;
 use uuid::Uuid;
 
-/// A blob goes to a bucket in parts of so many bytes: 10,000 of them, which is the most, make 160 GiB.
+/// Size of a part of a multipart upload to a bucket, bytes. The maximum of 10,000 parts makes 160 GiB.
 const PART_BYTES: usize = 16 << 20;
-/// Parts of one blob on their way at once.
+/// Parts of one blob that are sent at the same time.
 const PARTS_AT_ONCE: usize = 2;
-/// Blobs on their way to a bucket at once, so that uploads that come together take no more memory than these; the others
-/// wait on disk.
+/// Blobs that are sent to a bucket at the same time, which bounds memory; others wait on disk.
 const SENDERS: usize = 4;
-/// Bytes read from disk at once on the way to a bucket.
+/// Size of a read from disk on the way to a bucket, bytes.
 const READ_BYTES: usize = 1 << 20;
-
-/// A SHA-256 digest.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub struct Digest(pub [u8; 32]);
-
-impl Digest {
-    /// The digest of some bytes.
-    pub fn of(bytes: &[u8]) -> Self {
-        Self(sha2::Sha256::digest(bytes).into())
-    }
-
-    /// The digest of a file, which is read in parts.
-    pub fn of_file(path: &Path) -> std::io::Result<Self> {
-        let mut file = BufReader::with_capacity(1 << 20, std::fs::File::open(path)?);
-        let mut hasher = sha2::Sha256::new();
-        loop {
-            let bytes = file.fill_buf()?;
-            if bytes.is_empty() {
-                return Ok(Self(hasher.finalize().into()));
-            }
-            hasher.update(bytes);
-            let count = bytes.len();
-            file.consume(count);
-        }
-    }
-}
-
-impl fmt::Display for Digest {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.0.iter().try_for_each(|byte| write!(f, "{byte:02x}"))
-    }
-}
-
-impl FromStr for Digest {
-    type Err = ();
-
-    fn from_str(text: &str) -> Result<Self, ()> {
-        if text.len() != 64 || !text.bytes().all(|b| b.is_ascii_hexdigit()) {
-            return Err(());
-        }
-        let mut digest = [0; 32];
-        for (byte, pair) in digest.iter_mut().zip(text.as_bytes().chunks(2)) {
-            let pair = std::str::from_utf8(pair).map_err(|_| ())?;
-            *byte = u8::from_str_radix(pair, 16).map_err(|_| ())?;
-        }
-        Ok(Self(digest))
-    }
-}
 
 /// A whole file on local disk that is not stored yet; it is deleted with this value.
 #[derive(Debug)]
@@ -98,8 +50,8 @@ pub struct Blobs {
     /// hard link, without copying either.
     local: Option<PathBuf>,
     pub(super) staging: PathBuf,
-    uploads: PathBuf,
-    /// What this data folder is called among those of a bucket.
+    pub(super) uploads: PathBuf,
+    /// The identifier of this data folder among those that share a bucket.
     pub(super) home: Option<Uuid>,
     /// One permit for each blob that may be on its way to a bucket.
     pub(super) senders: Arc<Semaphore>,
@@ -116,7 +68,7 @@ impl Blobs {
         Self::new(Arc::new(store), Some(root), data)
     }
 
-    /// Blobs in an S3-compatible store, which `settings` tell how to reach; what is on its way in stays in the data folder
+    /// Blobs in an S3-compatible store with these connection settings; incoming files stay in the data folder
     /// of this machine until it is whole.
     pub fn in_bucket(data: &Path, bucket: &Bucket, settings: AmazonS3Builder) -> Result<Self, StoreError> {
         Self::new(bucket.open(settings)?, None, data)
@@ -129,7 +81,7 @@ impl Blobs {
         }
         let home = match &local {
             Some(_) => None,
-            None => Some(pieces::name_of(data).map_err(io("name the folder", data))?),
+            None => Some(server_id(data).map_err(io("name the folder", data))?),
         };
         Ok(Self { store, local, staging, uploads, home, senders: Arc::new(Semaphore::new(SENDERS)) })
     }
@@ -139,7 +91,7 @@ impl Blobs {
         &self.staging
     }
 
-    /// What this data folder is called, where others may have the bytes of an upload.
+    /// The identifier of this data folder, where several share a bucket.
     pub fn home(&self) -> Option<Uuid> {
         self.home
     }
@@ -149,25 +101,7 @@ impl Blobs {
         self.uploads.join(id.to_string())
     }
 
-    /// Deletes the bytes of uploads that are not known, but for those so young that they may be just beginning.
-    pub async fn sweep_uploads(&self, known: HashSet<UploadId>, young: Duration) -> Result<(), StoreError> {
-        let known: HashSet<String> = known.iter().map(UploadId::to_string).collect();
-        self.sweep_pieces(&known, young).await?;
-        let uploads = self.uploads.clone();
-        run_blocking("clean the folder", uploads.clone(), move || {
-            for entry in std::fs::read_dir(&uploads)? {
-                let entry = entry?;
-                let old = entry.metadata()?.modified()?.elapsed().is_ok_and(|age| age > young);
-                if old && !entry.file_name().to_str().is_some_and(|name| known.contains(name)) {
-                    std::fs::remove_file(entry.path())?;
-                }
-            }
-            Ok(())
-        })
-        .await
-    }
-
-    /// Deletes what crashes left among the files on their way in: whatever nobody touched for so long.
+    /// Deletes files that crashes left in the staging folder: those not touched for so long.
     pub async fn sweep_staging(&self, untouched: Duration) -> Result<(), StoreError> {
         let staging = self.staging.clone();
         run_blocking("clean the folder", staging.clone(), move || {
@@ -297,7 +231,7 @@ impl Blobs {
         Ok(None)
     }
 
-    /// Deletes a blob; one that is not there is none of its worries.
+    /// Deletes a blob, if it exists.
     pub async fn delete(&self, plant: PlantId, sha256: Digest) -> Result<(), StoreError> {
         match self.store.delete(&key(plant, sha256)).await {
             Ok(()) | Err(object_store::Error::NotFound { .. }) => Ok(()),
@@ -323,6 +257,19 @@ impl Blobs {
     /// Free bytes for those who are not root on the disk that takes what comes in.
     pub fn free_bytes(&self) -> Result<u64, StoreError> {
         free_bytes(&self.staging).map_err(io("look for free space in", &self.staging))
+    }
+
+    /// Fails where no file can be written to the staging folder.
+    pub async fn try_to_write(&self) -> Result<(), StoreError> {
+        /// More than one block of any file system.
+        const BYTES: usize = 64 << 10;
+        let staging = self.staging.clone();
+        run_blocking("write a file in", staging.clone(), move || {
+            let mut file = tempfile::Builder::new().prefix("probe-").tempfile_in(&staging)?;
+            file.write_all(&[0; BYTES])?;
+            file.as_file().sync_all()
+        })
+        .await
     }
 
     /// Fails where the blob store does not answer.
@@ -353,7 +300,7 @@ fn key(plant: PlantId, sha256: Digest) -> Key {
 fn move_into_place(staged: TempPath, target: &Path) -> std::io::Result<()> {
     let folder = target.parent().ok_or(std::io::ErrorKind::InvalidInput)?;
     std::fs::create_dir_all(folder)?;
-    // Readers get hard links to it: nobody may write to it.
+    // Readers get hard links to it, so it must not be written to.
     let mut permissions = std::fs::metadata(&staged)?.permissions();
     permissions.set_readonly(true);
     std::fs::set_permissions(&staged, permissions)?;
@@ -369,7 +316,7 @@ pub(super) fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Erro
     move |source| StoreError::Io { action, path, source }
 }
 
-async fn run_blocking<T: Send + 'static>(
+pub(super) async fn run_blocking<T: Send + 'static>(
     action: &'static str,
     path: PathBuf,
     work: impl FnOnce() -> std::io::Result<T> + Send + 'static,

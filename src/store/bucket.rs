@@ -1,6 +1,6 @@
 //! A place in an S3-compatible store.
 
-use super::StoreError;
+use super::error::StoreError;
 use object_store::aws::{AmazonS3Builder, AmazonS3ConfigKey};
 use object_store::path::Path as Key;
 use object_store::prefix::PrefixStore;

@@ -1,26 +1,30 @@
-//! Bytes that nothing names any more, because other bytes came in their place or because their upload was never ended, are
-//! deleted after a while.
+//! Deletes blobs to which no row refers any more, because a file was replaced or an upload never finished, after a while.
 //!
-//! A plant stores the same bytes once, whatever names them, and a row that names them must find them. Therefore each step is
-//! one transaction that has the plant's row: when a file is replaced and nothing else names what it was, that is noted with
-//! the time; an upload that brings the same bytes again notes a new time before it looks for them, and that they are named
-//! together with the row that names them; what has been unused for long is marked as being deleted, after which nobody may
-//! reserve or name it until its bytes and then its row are gone. So an upload comes either before the mark, and keeps the
-//! bytes, or after the row is gone, and brings them anew.
+//! A plant stores the same bytes once, for any number of rows, and a row must always find its bytes. Therefore each step is a
+//! transaction that locks the plant's row:
 //!
-//! The while is long, because what reads bytes without a row of its own needs them a little longer: a backup that has copied
-//! the rows, and a job that began before (of whose plant nothing is deleted while it runs, however long that is).
+//! 1. Replacing a file records the time from which its previous bytes are unused, if no other row refers to them.
+//! 2. An upload of the same bytes renews that time before it checks whether they exist. The row that refers to them clears it.
+//! 3. Blobs that have been unused for long are marked as being deleted. From then on they cannot be reserved or referred to,
+//!    until their bytes and then their row are gone.
+//!
+//! So an upload comes either before the mark and keeps the bytes, or after the row is gone and stores them again.
+//!
+//! The while is long, because bytes are also read without a reference: by a backup that has copied the rows, and by a job that
+//! began before. Nothing of a plant is deleted while one of its jobs runs.
 
-use super::{Blobs, Store, StoreError};
+use super::blobs::Blobs;
+use super::error::StoreError;
+use super::repository::Store;
 use jiff::Timestamp;
 use std::time::{Duration, Instant};
 
-/// How long whoever deletes bytes may take before another does it.
+/// How long a claim for deletion lasts.
 const LEASE: Duration = Duration::from_secs(60);
-/// Blobs of a plant, and plants, that are taken at once.
-const AT_ONCE: u32 = 100;
+/// Maximum number of plants, and of blobs of each, that are claimed at a time.
+const BATCH: u32 = 100;
 
-/// Deletes the bytes that others had begun to delete, and did not come to the end of.
+/// Deletes the bytes of blobs whose deletion another process began and did not finish.
 ///
 /// # Errors
 /// A store that does not answer.
@@ -28,8 +32,8 @@ pub async fn free_abandoned(store: &dyn Store, blobs: &Blobs) -> Result<usize, S
     free_unused(store, blobs, Timestamp::MIN).await
 }
 
-/// Deletes the bytes that have been unused since before a time, or that were to be deleted by somebody who fell silent; how
-/// many blobs that were.
+/// Deletes the bytes of blobs that have been unused since before a time, or whose deletion another process did not finish.
+/// Returns the number of blobs.
 ///
 /// # Errors
 /// A store that does not answer. What is left is deleted the next time.
@@ -37,12 +41,12 @@ pub async fn free_unused(store: &dyn Store, blobs: &Blobs, before: Timestamp) ->
     let mut freed = 0;
     loop {
         let begun = Instant::now();
-        let taken = store.take_unused_blobs(before, LEASE, AT_ONCE, Timestamp::now()).await?;
+        let taken = store.take_unused_blobs(before, LEASE, BATCH, Timestamp::now()).await?;
         if taken.is_empty() {
             return Ok(freed);
         }
         for unused in taken {
-            // Whoever was slow, or asleep, may not be the only one any more.
+            // After a pause, for example of the machine, another process may have claimed the same blobs.
             if begun.elapsed() > LEASE / 4 {
                 return Ok(freed);
             }

@@ -1,14 +1,14 @@
-//! Names that people give to what the service keeps.
+//! Names of organisations, plants, surveys and keys.
 
-/// Most characters of a name.
+/// Maximum number of characters of a name.
 const MAX_CHARACTERS: usize = 200;
 
-/// Why a text is no name.
+/// The text is not a valid name.
 #[derive(Debug, thiserror::Error, PartialEq, Eq)]
 #[error("a name has 1 to {MAX_CHARACTERS} characters, no line breaks and none that steer how text is shown")]
 pub struct InvalidName;
 
-/// Reads a name: one line, not empty, not endless, shown as it is written. Spaces around it are no part of it.
+/// Validates a name and trims spaces around it.
 pub fn checked(name: &str) -> Result<&str, InvalidName> {
     let name = name.trim();
     let length = name.chars().count();

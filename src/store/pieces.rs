@@ -1,28 +1,26 @@
-//! Uploads that are not whole, where several servers share a bucket: the server that takes some bytes writes them to its own
-//! disk and puts them into the bucket as well, before they count, so that whichever server the client comes back to goes on.
+//! Unfinished uploads where several servers share a bucket. The server that receives bytes writes them to its own disk and, as
+//! a piece, to the bucket before it acknowledges them, so that the client can continue with any server.
 //!
-//! What counts, the row tells: how many bytes, and which pieces these are. A piece whose bytes did not come to count,
-//! because another server was told of others first, is none of the upload's. A server's disk has the bytes of its own
-//! pieces and all before them, and fetches those behind them.
+//! The upload's row records how many bytes are acknowledged and in which pieces they are. A piece that is not recorded, because
+//! another server was faster, does not belong to the upload. A server's disk has the bytes of its own pieces and all before
+//! them; it fetches later ones.
 
-use super::blobs::io;
-use super::{Blobs, StoreError, UploadId};
+use super::blobs::{Blobs, io, run_blocking};
+use super::error::StoreError;
+use super::ids::UploadId;
 use futures::TryStreamExt;
 use object_store::path::Path as Key;
 use object_store::{ObjectStore, ObjectStoreExt};
 use std::collections::HashSet;
-use std::io::{SeekFrom, Write};
-use std::path::Path;
+use std::io::SeekFrom;
 use std::time::Duration;
 use tokio::io::{AsyncReadExt, AsyncSeekExt, AsyncWriteExt};
 use uuid::Uuid;
 
-/// Bytes of a piece at the most.
+/// Maximum size of a piece, bytes.
 const PIECE_BYTES: u64 = 8 << 20;
 /// The folder of all pieces.
 const FOLDER: &str = "uploads";
-/// The file of a data folder that names it.
-const NAME: &str = "server-id";
 
 /// Bytes of an upload's file that are in the bucket.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -31,7 +29,7 @@ pub struct Piece {
     pub from: u64,
     pub to: u64,
     pub name: Uuid,
-    /// The data folder whose file of the upload has them, and all before them.
+    /// The data folder whose file of the upload has these bytes and all before them.
     pub home: Uuid,
 }
 
@@ -39,24 +37,8 @@ fn key(id: UploadId, name: Uuid) -> Key {
     Key::from(format!("{FOLDER}/{id}/{name}"))
 }
 
-/// Reads what a data folder is called among those of one bucket; a new one is given a name.
-pub(super) fn name_of(data: &Path) -> std::io::Result<Uuid> {
-    let path = data.join(NAME);
-    if !path.exists() {
-        let mut file = tempfile::NamedTempFile::new_in(data)?;
-        file.write_all(Uuid::new_v4().to_string().as_bytes())?;
-        file.as_file().sync_all()?;
-        match file.persist_noclobber(&path) {
-            Err(error) if error.error.kind() != std::io::ErrorKind::AlreadyExists => return Err(error.error),
-            _ => std::fs::File::open(data)?.sync_all()?,
-        }
-    }
-    std::fs::read_to_string(path)?.trim().parse().map_err(std::io::Error::other)
-}
-
 impl Blobs {
-    /// Puts the bytes from one offset of an upload's file to another into the bucket, where there is one: the pieces that
-    /// they are, in order.
+    /// Copies a range of an upload's file to the bucket, where there is one. Returns the pieces, in order.
     pub async fn keep_pieces(&self, id: UploadId, from: u64, to: u64) -> Result<Vec<Piece>, StoreError> {
         let Some(home) = self.home else { return Ok(Vec::new()) };
         let path = self.upload_file(id);
@@ -76,17 +58,16 @@ impl Blobs {
         Ok(pieces)
     }
 
-    /// Deletes pieces that did not come to count; what cannot be deleted now goes with the upload.
+    /// Deletes pieces that were not recorded; those that cannot be deleted now are deleted with the upload.
     pub async fn drop_pieces(&self, id: UploadId, pieces: &[Piece]) {
         for piece in pieces {
             if let Err(error) = self.store.delete(&key(id, piece.name)).await {
-                tracing::warn!(%error, upload = %id, "a piece of an upload cannot be deleted");
+                tracing::warn!(%error, upload = %id, "cannot delete a piece of an upload");
             }
         }
     }
 
-    /// Leaves the first bytes of an upload's file, as many as `have`, and adds those of pieces that follow each other.
-    /// `has_room` tells whether the disk takes more.
+    /// Truncates an upload's file to `have` bytes and appends consecutive pieces. `has_room` fails where the disk is full.
     pub async fn bring_pieces(
         &self,
         id: UploadId,
@@ -110,26 +91,44 @@ impl Blobs {
         file.sync_all().await.map_err(io("write", &path))
     }
 
-    /// Deletes an upload's bytes, wherever they are; what cannot be deleted now is swept up later.
+    /// Deletes an upload's bytes on disk and in the bucket; those that cannot be deleted now are swept later.
     pub async fn drop_upload(&self, id: UploadId) {
         let file = self.upload_file(id);
         if let Err(error) = tokio::fs::remove_file(&file).await
             && error.kind() != std::io::ErrorKind::NotFound
         {
-            tracing::warn!(%error, path = %file.display(), "an upload's file cannot be deleted");
+            tracing::warn!(%error, path = %file.display(), "cannot delete the file of an upload");
         }
         if self.home.is_some() {
             let folder = Key::from(format!("{FOLDER}/{id}"));
             let keys = self.store.list(Some(&folder)).map_ok(|object| object.location);
             let deleted = self.store.delete_stream(Box::pin(keys)).try_for_each(|_| async { Ok(()) }).await;
             if let Err(error) = deleted {
-                tracing::warn!(%error, upload = %id, "the pieces of an upload cannot be deleted");
+                tracing::warn!(%error, upload = %id, "cannot delete the pieces of an upload");
             }
         }
     }
 
-    /// Deletes the pieces of uploads that are not known, but for those so young that they may be just beginning.
-    pub(super) async fn sweep_pieces(&self, known: &HashSet<String>, young: Duration) -> Result<(), StoreError> {
+    /// Deletes bytes of unknown uploads, except young ones, which may belong to an upload that is just beginning.
+    pub async fn sweep_uploads(&self, known: HashSet<UploadId>, young: Duration) -> Result<(), StoreError> {
+        let known: HashSet<String> = known.iter().map(UploadId::to_string).collect();
+        self.sweep_pieces(&known, young).await?;
+        let uploads = self.uploads.clone();
+        run_blocking("clean the folder", uploads.clone(), move || {
+            for entry in std::fs::read_dir(&uploads)? {
+                let entry = entry?;
+                let old = entry.metadata()?.modified()?.elapsed().is_ok_and(|age| age > young);
+                if old && !entry.file_name().to_str().is_some_and(|name| known.contains(name)) {
+                    std::fs::remove_file(entry.path())?;
+                }
+            }
+            Ok(())
+        })
+        .await
+    }
+
+    /// Deletes pieces of unknown uploads, except young ones, which may belong to an upload that is just beginning.
+    async fn sweep_pieces(&self, known: &HashSet<String>, young: Duration) -> Result<(), StoreError> {
         if self.home.is_none() {
             return Ok(());
         }
@@ -143,18 +142,5 @@ impl Blobs {
             }
         }
         Ok(())
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_data_folder_keeps_its_name() {
-        let [one, other] = [(); 2].map(|()| tempfile::tempdir().unwrap());
-        let name = name_of(one.path()).unwrap();
-        assert_eq!(name_of(one.path()).unwrap(), name);
-        assert_ne!(name_of(other.path()).unwrap(), name);
     }
 }

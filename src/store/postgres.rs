@@ -1,45 +1,65 @@
 //! The rows in a Postgres database, which servers and workers on any number of machines share.
 
-#[path = "backend/mod.rs"]
-mod backend;
-
-use super::StoreError;
-use super::schema::Examined;
-use super::sql::postgres as queues;
-use sqlx::postgres::{PgConnectOptions, PgListener, PgPool, PgPoolOptions, PgSslMode};
-use sqlx::{Postgres, Transaction};
+use super::connections::{Connections, Transaction};
+use super::error::StoreError;
+use sqlx::Postgres;
+use sqlx::migrate::Migrator;
+use sqlx::postgres::{PgConnectOptions, PgListener, PgPoolOptions, PgSslMode};
 use std::net::IpAddr;
 use std::time::Duration;
 use tokio::sync::Notify;
 
+// What the methods in `backend` need to know of this database.
 use PostgresStore as Rows;
 use sqlx::postgres::PgRow as Row;
 type Db = Postgres;
-type Tx = Transaction<'static, Db>;
+type Tx = Transaction<Db>;
+/// The URL of a database.
+type Place = str;
+
+/// The changes of the schema, in order.
+static MIGRATOR: Migrator = sqlx::migrate!("migrations/postgres");
+
+/// Appended to the choice of a row that is then updated: rows that another transaction holds are passed over instead of
+/// waited for.
+macro_rules! skip_locked {
+    () => {
+        " FOR NO KEY UPDATE OF candidate SKIP LOCKED"
+    };
+}
+
+/// The texts of the JSON array that is bound to a parameter, as a subquery.
+macro_rules! json_texts {
+    ($parameter:literal) => {
+        concat!("(SELECT jsonb_array_elements_text(CAST(", $parameter, " AS JSONB)))")
+    };
+}
+
+#[path = "backend/mod.rs"]
+mod backend;
 
 /// How long a statement waits for a connection.
 const ACQUIRE_TIMEOUT: Duration = Duration::from_secs(20);
-/// Most connections of one process.
+/// Maximum number of connections of one process.
 const MAX_CONNECTIONS: u32 = 10;
 /// Milliseconds since 1970 by the server's clock.
 const CLOCK: Option<&str> = Some("SELECT CAST(EXTRACT(EPOCH FROM clock_timestamp()) * 1000 AS BIGINT)");
-/// Where a process is cut off, the server ends its sessions and what they have locked after half a minute: by itself it
-/// would wait for hours.
-const LET_GO: &str = "\
+/// Ends the sessions of a process that lost its network, and their locks, after half a minute. The defaults are hours.
+const SESSION_SETTINGS: &str = "\
     SET idle_in_transaction_session_timeout = '30s'; SET tcp_keepalives_idle = 15; \
     SET tcp_keepalives_interval = 5; SET tcp_keepalives_count = 3";
 /// The lock under which jobs are queued and claimed: any number, as long as nothing else in the database takes it.
 const QUEUE_LOCK: i64 = 0x6865_6c69_6f6d_6170;
-/// The channel on which workers hear that there may be work.
+/// The channel on which workers are notified of work.
 const WORK: &str = "heliomap_work";
-/// How long after a lost connection it is listened again.
+/// Pause before listening again after a lost connection.
 const LISTEN_AGAIN: Duration = Duration::from_secs(10);
 
 /// The rows in a Postgres database.
 #[derive(Debug, Clone)]
 pub struct PostgresStore {
-    read: PgPool,
-    write: PgPool,
+    read: Connections<Db>,
+    write: Connections<Db>,
 }
 
 impl PostgresStore {
@@ -47,15 +67,16 @@ impl PostgresStore {
     pub async fn open(url: &str) -> Result<Self, StoreError> {
         let options = PgPoolOptions::new().max_connections(MAX_CONNECTIONS).acquire_timeout(ACQUIRE_TIMEOUT);
         let options = options.after_connect(|connection, _| {
-            Box::pin(async move { sqlx::raw_sql(LET_GO).execute(&mut *connection).await.map(drop) })
+            Box::pin(async move { sqlx::raw_sql(SESSION_SETTINGS).execute(&mut *connection).await.map(drop) })
         });
         let pool = options.connect(url).await?;
-        sqlx::migrate!("migrations/postgres").run(&pool).await?;
+        MIGRATOR.run(&pool).await?;
+        let pool = Connections::from(pool);
         Ok(Self { read: pool.clone(), write: pool })
     }
 
-    /// Whether nobody in between reads or changes what is said to the database at a URL: it is on this machine, or the
-    /// connection is encrypted and its certificate checked.
+    /// Whether the connection to the database at a URL is safe from eavesdropping and tampering: the database is on this
+    /// machine, or the connection is encrypted and its certificate checked.
     pub fn is_guarded(url: &str) -> Result<bool, StoreError> {
         let options: PgConnectOptions = url.parse()?;
         let host = options.get_host();
@@ -64,21 +85,25 @@ impl PostgresStore {
         Ok(here || host.starts_with('/') || options.get_socket().is_some() || is_checked)
     }
 
-    /// Looks at the database at a URL without changing its schema.
-    pub async fn examine(url: &str) -> Result<Examined, StoreError> {
+    /// Opens the database at a URL and leaves its schema as it is: another version of the program may be using it.
+    async fn open_as_it_is(url: &str) -> Result<Self, StoreError> {
         let options = PgPoolOptions::new().max_connections(1).acquire_timeout(ACQUIRE_TIMEOUT / 4);
-        let pool = options.connect(url).await?;
-        let rows = Self { read: pool.clone(), write: pool };
-        backend::examine::examine(&rows, &sqlx::migrate!("migrations/postgres")).await
+        let pool = Connections::from(options.connect(url).await?);
+        Ok(Self { read: pool.clone(), write: pool })
+    }
+
+    /// Ends all connections.
+    async fn close(&self) {
+        self.read.pool().close().await;
     }
 
     /// Name, open and idle connections of each pool.
     fn sizes(&self) -> Vec<(&'static str, u32, usize)> {
-        vec![("all", self.read.size(), self.read.num_idle())]
+        vec![("all", self.read.pool().size(), self.read.pool().num_idle())]
     }
 
-    async fn begin(&self) -> Result<Tx, StoreError> {
-        Ok(self.write.begin().await?)
+    async fn begin_any_schema(&self) -> Result<Tx, StoreError> {
+        Ok(self.write.begin("BEGIN").await?)
     }
 
     /// A transaction that looks at the whole queue: no other runs beside it.
@@ -88,28 +113,29 @@ impl PostgresStore {
         Ok(tx)
     }
 
-    /// Rings at every message of [`tell_of_work`], from whichever process.
-    async fn listen(&self, bell: &Notify) {
+    /// Notifies at every message of [`notify_workers`], from any process.
+    async fn listen(&self, work_notify: &Notify) {
         loop {
-            if let Err(error) = self.listen_while_it_lasts(bell).await {
-                tracing::warn!(%error, "the database tells of no work now: it is looked for now and then");
+            if let Err(error) = self.listen_once(work_notify).await {
+                tracing::warn!(%error, "listening for work failed; workers poll until it is back");
             }
             tokio::time::sleep(LISTEN_AGAIN).await;
         }
     }
 
-    async fn listen_while_it_lasts(&self, bell: &Notify) -> Result<(), sqlx::Error> {
-        let mut listener = PgListener::connect_with(&self.read).await?;
+    /// Listens until the connection is lost.
+    async fn listen_once(&self, work_notify: &Notify) -> Result<(), sqlx::Error> {
+        let mut listener = PgListener::connect_with(self.read.pool()).await?;
         listener.listen(WORK).await?;
         loop {
             listener.recv().await?;
-            bell.notify_one();
+            work_notify.notify_one();
         }
     }
 }
 
-/// Tells all that listen, when the transaction is committed, that there may be work.
-async fn tell_of_work(tx: &mut Tx) -> Result<(), StoreError> {
+/// Notifies all listening workers, when the transaction is committed, that there may be work.
+async fn notify_workers(tx: &mut Tx) -> Result<(), StoreError> {
     sqlx::query("SELECT pg_notify($1, '')").bind(WORK).execute(&mut **tx).await?;
     Ok(())
 }
@@ -119,7 +145,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn connections_that_nobody_reads() {
+    fn guarded_connections() {
         for (url, guarded) in [
             ("postgres://u:p@127.0.0.1/d", true),
             ("postgres://u:p@localhost/d?sslmode=disable", true),

@@ -1,13 +1,15 @@
-//! Requests that a client named, so that it may send them again, and how they were answered.
+//! Requests with an idempotency key of the client, and their answers.
 
-use super::{Digest, OrganisationId, StoreError};
+use super::digest::Digest;
+use super::error::StoreError;
+use super::ids::OrganisationId;
 use jiff::Timestamp;
 use uuid::Uuid;
 
-/// A request that was answered.
+/// The stored answer to a request.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct KeptAnswer {
-    /// What was asked.
+    /// Digest of the request.
     pub fingerprint: Digest,
     pub status: u16,
     /// Names and values, a JSON object.
@@ -15,21 +17,21 @@ pub struct KeptAnswer {
     pub body: Vec<u8>,
 }
 
-/// What is known of a request that begins.
+/// What is known of a request with this key.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Begun {
-    /// Nothing: it is this one's to answer.
+    /// Nothing: this request is to be answered.
     New,
-    /// Another one of that name is being answered.
+    /// Another request with this key is being answered.
     Running,
     /// It was answered before.
     Answered(Box<KeptAnswer>),
 }
 
-/// Requests by the names that their clients gave them, each organisation's its own.
+/// Requests by the idempotency keys of their clients, apart for each organisation.
 #[async_trait::async_trait]
 pub trait RequestStore: Send + Sync + 'static {
-    /// Takes a name until a time, unless it is taken already; `token` is whoever takes it.
+    /// Reserves a key until a time, unless it is reserved; `token` identifies this reservation.
     async fn begin_request(
         &self,
         organisation: OrganisationId,
@@ -38,7 +40,7 @@ pub trait RequestStore: Send + Sync + 'static {
         now: Timestamp,
         until: Timestamp,
     ) -> Result<Begun, StoreError>;
-    /// Keeps a name until another time, for whoever took it last.
+    /// Extends a reservation.
     async fn renew_request(
         &self,
         organisation: OrganisationId,
@@ -46,7 +48,7 @@ pub trait RequestStore: Send + Sync + 'static {
         token: Uuid,
         until: Timestamp,
     ) -> Result<(), StoreError>;
-    /// Keeps the answer to the request of that name until a time, of whoever took it last.
+    /// Stores the answer to a reserved request until a time.
     async fn keep_answer(
         &self,
         organisation: OrganisationId,
@@ -55,8 +57,8 @@ pub trait RequestStore: Send + Sync + 'static {
         answer: &KeptAnswer,
         until: Timestamp,
     ) -> Result<(), StoreError>;
-    /// Gives a name back, where no answer is kept, for whoever took it last.
+    /// Releases a reservation without an answer.
     async fn forget_request(&self, organisation: OrganisationId, name: &str, token: Uuid) -> Result<(), StoreError>;
-    /// Forgets what was kept long enough.
+    /// Deletes expired reservations and answers.
     async fn forget_old_requests(&self, now: Timestamp) -> Result<(), StoreError>;
 }

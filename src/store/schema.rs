@@ -1,14 +1,14 @@
-//! How a database stands to this program, looked at without changing anything.
+//! The schema of a database compared with that of this program, without changing anything.
 
-use super::StoreError;
+use super::error::StoreError;
 use jiff::Timestamp;
 
-/// How a database's schema stands to this program's.
+/// A database's schema compared with this program's.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Schema {
     /// There are no tables yet.
     Absent,
-    /// Some changes were not made yet.
+    /// Some changes are still to be made.
     Behind {
         missing: usize,
     },
@@ -18,7 +18,7 @@ pub enum Schema {
 }
 
 impl Schema {
-    /// From the changes that this program knows and those that were made.
+    /// Compares the changes that this program knows with those that were made.
     pub(super) fn of(known: impl IntoIterator<Item = i64>, made: &[i64]) -> Self {
         let known: Vec<i64> = known.into_iter().collect();
         let missing = known.iter().filter(|version| !made.contains(version)).count();
@@ -31,15 +31,15 @@ impl Schema {
     }
 }
 
-/// A database that was looked at.
+/// Result of examining a database.
 #[derive(Debug)]
 pub struct Examined {
     pub schema: Schema,
     /// Whether rows can be written, tried where the schema is current.
     pub writable: Result<(), StoreError>,
-    /// What its clock says, where it has one of its own.
+    /// The time of its own clock, where it has one.
     pub now: Option<Timestamp>,
-    /// Whether there is a key.
+    /// Whether there is a valid key.
     pub has_keys: bool,
 }
 

@@ -1,15 +1,16 @@
-//! What a client shows to be let in.
+//! Secrets of keys.
 
-use super::{Digest, SecretRecord};
+use super::access::SecretRecord;
+use super::digest::Digest;
 use std::fmt;
 
-/// Marks a secret of this service, so that one that leaked is known for what it is.
+/// Marks a secret of this service, so that scanners recognise a leaked one.
 const MARK: &str = "hm_";
 const RANDOM_BYTES: usize = 32;
-/// How much of a secret people see.
+/// Length of the visible beginning of a secret.
 const PREFIX: usize = MARK.len() + 8;
 
-/// A key's secret: `hm_` and 64 hexadecimal digits. It is shown once and kept nowhere.
+/// A key's secret: `hm_` and 64 hexadecimal digits. It is shown once and not stored.
 #[derive(Clone)]
 pub struct Secret(String);
 
@@ -21,7 +22,7 @@ impl Secret {
         Ok(Self(format!("{MARK}{}", Digest(bytes))))
     }
 
-    /// What is kept of it.
+    /// The record to be stored.
     pub fn record(&self) -> SecretRecord {
         SecretRecord { sha256: Digest::of(self.0.as_bytes()), prefix: self.0[..PREFIX].to_owned() }
     }
@@ -32,7 +33,7 @@ impl Secret {
     }
 }
 
-/// A log that holds a secret by mistake holds only its beginning.
+/// Shows only the beginning of the secret.
 impl fmt::Debug for Secret {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "Secret({}…)", &self.0[..PREFIX])

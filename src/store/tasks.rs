@@ -1,54 +1,56 @@
-//! Images of running jobs that other workers may search.
+//! Images of running jobs as tasks that other workers may run.
 
-use super::{Checkpoint, Claim, JobId, StoreError};
+use super::error::StoreError;
+use super::ids::JobId;
+use super::jobs::{Checkpoint, Claim};
 use heliomap_model::PlantId;
 use jiff::Timestamp;
 use std::time::Duration;
 use uuid::Uuid;
 
-/// An image that a running job has to search.
+/// An image of a running job.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ImageTask {
     pub image: String,
-    /// What a worker needs to know, JSON.
+    /// The task's input, JSON.
     pub document: String,
 }
 
-/// A task in the hands of a worker that is not the job's own.
+/// A task that a worker other than the job's own has claimed.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct TaskClaim {
     pub plant: PlantId,
     pub job: JobId,
     pub task: ImageTask,
-    /// Tells this claim from every other.
+    /// Identifies this claim.
     pub token: Uuid,
 }
 
-/// What a job's own worker gets when it asks for one of its images.
+/// The next task for the job's own worker.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum OwnTask {
-    /// This one is its.
+    /// This image is claimed for it.
     Image(String),
-    /// Others are at work on all that are left.
-    InOtherHands,
-    /// None is left, or the job is not its any more.
+    /// Other workers hold all remaining tasks.
+    HeldByOthers,
+    /// No task is left, or the lease was lost.
     None,
 }
 
-/// What becomes of a task that is given back.
+/// Who may run a returned task.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum GivenBack {
-    /// Anybody may take it.
+    /// Any worker.
     ToAll,
-    /// It could not be done: the job's own worker shall see why.
+    /// Only the job's own worker, because another one failed.
     ToOwner,
 }
 
-/// Images of running jobs that other workers may search.
+/// Image tasks of running jobs.
 #[async_trait::async_trait]
 pub trait TaskStore: Send + Sync + 'static {
-    /// Offers images of a claimed job, in place of all that it had offered, to workers with this mapper; `false` where the
-    /// claim was lost. What is found holds under this fingerprint.
+    /// Publishes images of a claimed job, in place of all earlier ones, for workers with this mapper; `false` where the lease was
+    /// lost. Results are stored under this fingerprint.
     async fn offer_tasks(
         &self,
         claim: &Claim,
@@ -56,20 +58,19 @@ pub trait TaskStore: Send + Sync + 'static {
         mapper: &str,
         tasks: &[ImageTask],
     ) -> Result<bool, StoreError>;
-    /// Takes one of a claimed job's own images, for as long as the job is claimed.
+    /// Claims a task of a claimed job for the job's own worker, for as long as it has the job.
     async fn take_own_task(&self, claim: &Claim, now: Timestamp) -> Result<OwnTask, StoreError>;
-    /// What others have found for a claimed job since the last time.
+    /// Takes results of other workers for a claimed job.
     async fn gather_tasks(&self, claim: &Claim) -> Result<Vec<Checkpoint>, StoreError>;
 
-    /// How many images wait for a worker, whoever's jobs they are of.
+    /// Number of tasks that wait for a worker, of all organisations.
     async fn waiting_tasks(&self, now: Timestamp) -> Result<u64, StoreError>;
-    /// Takes an image of a running job for a worker with this mapper: of the job of the highest priority, of these the
-    /// oldest.
+    /// Claims a task for a worker with this mapper: of the oldest running job of the highest priority.
     async fn take_task(&self, mapper: &str, lease: Duration, now: Timestamp) -> Result<Option<TaskClaim>, StoreError>;
-    /// Extends the leases of tasks; those that are lost are not among the answers.
+    /// Extends the leases of tasks and returns those that are still held.
     async fn extend_tasks(&self, tokens: &[Uuid], lease: Duration, now: Timestamp) -> Result<Vec<Uuid>, StoreError>;
-    /// Keeps what was found in a task's image as a checkpoint of its job; `false` where the task was lost.
+    /// Stores a task's result as a checkpoint of its job; `false` where the lease was lost.
     async fn finish_task(&self, claim: &TaskClaim, document: &[u8]) -> Result<bool, StoreError>;
-    /// Gives a task back; nothing happens where it was lost.
+    /// Returns a task; does nothing where the lease was lost.
     async fn give_back_task(&self, claim: &TaskClaim, to: GivenBack) -> Result<(), StoreError>;
 }

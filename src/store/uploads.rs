@@ -1,18 +1,13 @@
 //! Uploads that may be resumed.
 
-use super::records::row_id;
+use super::error::StoreError;
+use super::ids::{SurveyId, UploadId};
+use super::pieces::Piece;
 use super::usage::Quotas;
-use super::{Piece, StoreError, SurveyId};
 use heliomap_model::PlantId;
 use jiff::Timestamp;
-use std::fmt;
 use std::time::Duration;
 use uuid::Uuid;
-
-row_id!(
-    /// Identifies an upload that may be resumed.
-    UploadId
-);
 
 /// An upload that may be resumed.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -23,45 +18,45 @@ pub struct Upload {
     pub length: u64,
     /// Bytes that are safe on disk.
     pub received: u64,
-    /// Whether it is a part of a file that is put together later.
+    /// Whether it is a part of a file that is concatenated later.
     pub partial: bool,
-    /// From what it was put together, as the client told it; lists leave it out.
+    /// Its parts as the client named them (`Upload-Concat`); left out in lists.
     pub parts: Option<String>,
-    /// What the client told of the file, as it told it.
+    /// Metadata as the client sent it (`Upload-Metadata`).
     pub metadata: String,
     pub expires: Timestamp,
-    /// What became of the whole file, JSON.
+    /// Outcome of storing the whole file, JSON.
     pub outcome: Option<String>,
-    /// The data folder that has its bytes, where others share the bucket ([`Blobs::home`](super::Blobs::home)).
+    /// The data folder that has its bytes, where several share the bucket ([`Blobs::home`](super::Blobs::home)).
     pub home: Option<Uuid>,
 }
 
-/// What an upload that begins must keep to.
+/// Limits for a new upload.
 #[derive(Debug, Clone, Copy)]
 pub struct UploadBounds {
-    /// What holds for what was not said of the organisation alone.
+    /// Quotas where the organisation has none of its own.
     pub quotas: Quotas,
-    /// Most unfinished uploads of an organisation.
+    /// Maximum number of unfinished uploads of an organisation.
     pub open: u64,
-    /// Whether its bytes may be in the survey already. Then they fit where they would if nothing was kept: storing them
-    /// tells whether they count.
+    /// Whether its bytes may be stored already. Then stored bytes are not counted against the quota here; storing the file counts
+    /// them.
     pub may_be_there: bool,
 }
 
 /// Uploads that may be resumed.
 #[async_trait::async_trait]
 pub trait UploadStore: Send + Sync + 'static {
-    /// Notes an upload to come, within bounds unless it was put together from others, which it replaces:
-    /// [`StoreError::OverQuota`] where what it announces does not fit, [`StoreError::TooManyUploads`] where there are too many.
+    /// Creates an upload, within limits unless it is a concatenation of others, which it replaces. Fails with
+    /// [`StoreError::OverQuota`] where its announced length does not fit, [`StoreError::TooManyUploads`] where there are too many.
     async fn create_upload(
         &self,
         upload: &Upload,
         bounds: Option<&UploadBounds>,
         now: Timestamp,
     ) -> Result<(), StoreError>;
-    /// One upload to a survey, expired ones included.
+    /// One upload to a survey, even if expired.
     async fn upload(&self, survey: SurveyId, id: UploadId) -> Result<Option<Upload>, StoreError>;
-    /// A survey's uploads that are not expired, in the order of their identifiers: at most `limit` of those after a text.
+    /// A survey's uploads that are not expired, in order of their identifiers: at most `limit` of those after `after`.
     async fn uploads_of_survey(
         &self,
         survey: SurveyId,
@@ -69,8 +64,8 @@ pub trait UploadStore: Send + Sync + 'static {
         limit: u32,
         now: Timestamp,
     ) -> Result<Vec<Upload>, StoreError>;
-    /// Notes how many bytes are safe, in which data folder and in which further pieces, and a new end of its life; `false`
-    /// where the upload is gone, or is not as it was told.
+    /// Records how many bytes are safe, in which data folder and in which further pieces, and a new expiry; `false` where the
+    /// upload was deleted or changed meanwhile.
     async fn upload_received(
         &self,
         upload: &Upload,
@@ -79,10 +74,10 @@ pub trait UploadStore: Send + Sync + 'static {
         pieces: &[Piece],
         expires: Timestamp,
     ) -> Result<bool, StoreError>;
-    /// The pieces that count, in order.
+    /// The recorded pieces, in order.
     async fn upload_pieces(&self, id: UploadId) -> Result<Vec<Piece>, StoreError>;
-    /// Takes a whole file that nobody else is storing, or goes on to have it, until `lease` is over; `false` where somebody
-    /// is, where it is known what became of it, or where it is gone.
+    /// Claims, or keeps, a complete upload for storing it, for `lease`; `false` where another process has it, it is stored, or it
+    /// was deleted.
     async fn take_upload_end(
         &self,
         id: UploadId,
@@ -90,14 +85,14 @@ pub trait UploadStore: Send + Sync + 'static {
         lease: Duration,
         now: Timestamp,
     ) -> Result<bool, StoreError>;
-    /// Notes what became of the whole file, JSON, by whoever has it; where nothing is to be noted, others may take it.
+    /// Records the outcome of storing it, JSON; without one, another process may claim it.
     async fn end_upload(&self, id: UploadId, token: Uuid, outcome: Option<&str>) -> Result<(), StoreError>;
-    /// Forgets an upload; whether there was one.
+    /// Deletes an upload; `false` where there was none.
     async fn delete_upload(&self, survey: SurveyId, id: UploadId) -> Result<bool, StoreError>;
-    /// Forgets uploads whose time is over.
+    /// Deletes expired uploads.
     async fn delete_expired_uploads(&self, now: Timestamp) -> Result<(), StoreError>;
     /// A plant's uploads.
     async fn uploads_of_plant(&self, plant: PlantId) -> Result<Vec<UploadId>, StoreError>;
-    /// All uploads that are known.
+    /// All uploads.
     async fn uploads(&self) -> Result<Vec<UploadId>, StoreError>;
 }

@@ -1,14 +1,17 @@
-//! What an organisation keeps, and what it may keep.
+//! What an organisation stores, what it may store, and blobs that no row refers to.
 
-use super::{BlobRecord, Digest, Organisation, OrganisationId, StoreError};
+use super::access::Organisation;
+use super::digest::Digest;
+use super::error::StoreError;
+use super::ids::OrganisationId;
 use heliomap_model::PlantId;
 use jiff::Timestamp;
 use std::time::Duration;
 
-/// As much as there is room for.
+/// No quota.
 pub const UNLIMITED: u64 = i64::MAX as u64;
 
-/// What an organisation may keep; where nothing is said, what holds for all.
+/// Quotas of an organisation; `None` means the default of the service.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Quotas {
     /// Bytes of files and models.
@@ -18,13 +21,13 @@ pub struct Quotas {
 }
 
 impl Quotas {
-    /// These, and others for what they do not say.
+    /// These quotas, completed by others.
     pub fn or(self, others: Self) -> Self {
         Self { bytes: self.bytes.or(others.bytes), plants: self.plants.or(others.plants) }
     }
 }
 
-/// What an organisation keeps.
+/// What an organisation stores.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Usage {
     /// Bytes of files and models; in a plant, the same bytes count once.
@@ -32,31 +35,40 @@ pub struct Usage {
     /// Bytes that resumable uploads announced and that are not stored yet.
     pub announced_bytes: u64,
     pub plants: u64,
-    /// What was said of this organisation alone.
+    /// Quotas of this organisation alone.
     pub own: Quotas,
 }
 
-/// A blob that no row names, in the hands of whoever deletes its bytes.
+/// A blob that rows refer to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct BlobRecord {
+    pub plant: PlantId,
+    pub sha256: Digest,
+    /// Bytes.
+    pub size: u64,
+}
+
+/// A blob without references that this process has claimed for deletion.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct UnusedBlob {
     pub blob: BlobRecord,
-    /// When it was taken to be deleted.
+    /// When it was claimed.
     pub taken: Timestamp,
 }
 
-/// What organisations keep, and may keep.
+/// Storage used by organisations, their quotas, and references to blobs.
 #[async_trait::async_trait]
 pub trait UsageStore: Send + Sync + 'static {
-    /// All organisations by name, each with what it keeps.
+    /// All organisations by name, each with its usage.
     async fn organisations(&self, now: Timestamp) -> Result<Vec<(Organisation, Usage)>, StoreError>;
-    /// What an organisation keeps.
+    /// The usage of an organisation.
     async fn usage(&self, organisation: OrganisationId, now: Timestamp) -> Result<Option<Usage>, StoreError>;
-    /// Says what an organisation may keep.
+    /// Sets the quotas of an organisation.
     async fn set_quotas(&self, organisation: OrganisationId, own: Quotas) -> Result<(), StoreError>;
-    /// Counts bytes that are about to be stored in a plant, each by digest and size; those that it keeps already count for
-    /// nothing more. [`StoreError::OverQuota`] where they do not fit, [`StoreError::BeingFreed`] where some are just being
-    /// deleted: none is counted then. `defaults` holds for what was not said of the organisation alone. What no row comes to
-    /// name is unused from `now` on.
+    /// Counts blobs that are about to be stored in a plant, by digest and size; blobs that it has already are not counted again.
+    /// Fails with [`StoreError::OverQuota`] where they do not fit and [`StoreError::BeingFreed`] where some are being deleted;
+    /// none is counted then. `defaults` applies where the organisation has no quota of its own. Blobs are unused from `now`
+    /// on until a row refers to them.
     async fn reserve_bytes(
         &self,
         plant: PlantId,
@@ -65,12 +77,12 @@ pub trait UsageStore: Send + Sync + 'static {
         now: Timestamp,
     ) -> Result<(), StoreError>;
 
-    /// Counts a model that is about to be stored in a plant, which no quota forbids; else as [`Self::reserve_bytes`].
+    /// As [`Self::reserve_bytes`] for a model, without a quota.
     async fn reserve_model(&self, plant: PlantId, model: (Digest, u64), now: Timestamp) -> Result<(), StoreError>;
 
-    /// Takes blobs that have been unused since before a time, so that their bytes can be deleted: of each of at most `limit`
-    /// plants at most as many, and none of a plant of which a job runs, for that may still read them. Until it is told that
-    /// one is gone nobody may reserve or name it; where that is not told within `lease`, it is taken again.
+    /// Claims blobs that have been unused since before a time, to delete their bytes: at most `limit` of each of at most `limit`
+    /// plants, and none of a plant with a running job, which may still read them. A claimed blob cannot be reserved or
+    /// referred to. A claim that does not end in [`Self::blob_is_gone`] within `lease` is made again.
     async fn take_unused_blobs(
         &self,
         before: Timestamp,
@@ -78,6 +90,9 @@ pub trait UsageStore: Send + Sync + 'static {
         limit: u32,
         now: Timestamp,
     ) -> Result<Vec<UnusedBlob>, StoreError>;
-    /// Notes that the bytes of a blob are gone, which counts no more; `false` where it was taken again, or is forgotten.
+    /// Records that the bytes of a claimed blob are deleted, and counts them no longer; `false` where it was claimed again or is
+    /// gone.
     async fn blob_is_gone(&self, unused: &UnusedBlob) -> Result<bool, StoreError>;
+    /// The blobs that files and models refer to, once per plant, by plant and digest: at most `limit` of those after `after`.
+    async fn blobs(&self, after: Option<(PlantId, Digest)>, limit: u32) -> Result<Vec<BlobRecord>, StoreError>;
 }

@@ -1,29 +1,22 @@
-//! Where organisations want to hear of the ends of their jobs, and what is to be sent there.
+//! Webhooks of organisations, and the messages that are to be sent to them when jobs end.
 
-use super::records::row_id;
-use super::{Digest, Job, JobId, OrganisationId, Page, StoreError};
+use super::digest::Digest;
+use super::error::StoreError;
+use super::ids::{DeliveryId, JobId, OrganisationId, WebhookId};
+use super::jobs::Job;
+use super::listing::Page;
 use heliomap_model::PlantId;
 use jiff::Timestamp;
 use std::fmt;
 use std::str::FromStr;
 use std::time::Duration;
-use uuid::Uuid;
 
-row_id!(
-    /// Identifies a webhook: an address that is told of the ends of jobs.
-    WebhookId
-);
-row_id!(
-    /// Identifies a delivery: one message to one webhook.
-    DeliveryId
-);
-
-/// Most webhooks of an organisation.
+/// Maximum number of webhooks of an organisation.
 pub const MAX_WEBHOOKS: u32 = 100;
-/// How often a message is tried before it is dead.
+/// Maximum number of attempts to send a message.
 pub const MAX_ATTEMPTS: u32 = 8;
 
-/// What the messages to a webhook are signed with.
+/// The key by which messages to a webhook are signed.
 #[derive(Clone)]
 pub struct SigningSecret(String);
 
@@ -35,13 +28,13 @@ impl SigningSecret {
         Ok(Self(format!("whs_{}", Digest(bytes))))
     }
 
-    /// One that someone else made; `None` where it is not 16 to 200 visible ASCII characters.
+    /// A secret chosen by the caller; `None` where it is not 16 to 200 visible ASCII characters.
     pub fn given(text: &str) -> Option<Self> {
         let good = (16..=200).contains(&text.len()) && text.bytes().all(|byte| byte.is_ascii_graphic());
         good.then(|| Self(text.to_owned()))
     }
 
-    /// One that the store kept.
+    /// A secret from the database.
     pub(super) fn kept(text: String) -> Self {
         Self(text)
     }
@@ -58,19 +51,19 @@ impl fmt::Debug for SigningSecret {
     }
 }
 
-/// An address that is told of the ends of jobs.
+/// A URL that is notified when jobs end.
 #[derive(Clone)]
 pub struct Webhook {
     pub seq: i64,
     pub id: WebhookId,
     pub organisation: OrganisationId,
-    /// The plant whose jobs it is told of; all of the organisation's where there is none.
+    /// The plant of these jobs; `None` for all plants of the organisation.
     pub plant: Option<PlantId>,
     pub url: String,
     pub created: Timestamp,
 }
 
-/// The URL may hold what opens the receiver, which no log shall.
+/// The URL may contain a secret, which must not be logged.
 impl fmt::Debug for Webhook {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Webhook").field("id", &self.id).finish_non_exhaustive()
@@ -86,12 +79,12 @@ pub struct NewWebhook {
     pub secret: SigningSecret,
 }
 
-/// Where a message stands.
+/// State of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum DeliveryState {
     Waiting,
     Delivered,
-    /// Tried as often as it is tried.
+    /// All attempts failed.
     Dead,
 }
 
@@ -125,23 +118,23 @@ pub struct Delivery {
     pub webhook: WebhookId,
     pub job: JobId,
     pub state: DeliveryState,
-    /// How often it was tried.
+    /// Number of attempts so far.
     pub attempts: u32,
-    /// How often it is still tried.
+    /// Number of attempts left.
     pub attempts_left: u32,
-    /// When it is tried next, where it waits.
+    /// When a waiting message is sent next.
     pub run_after: Timestamp,
-    /// Why it did not arrive the last time.
+    /// Why the last attempt failed.
     pub error: Option<String>,
     pub created: Timestamp,
-    /// When it arrived or was given up.
+    /// When it was delivered, or its last attempt failed.
     pub finished: Option<Timestamp>,
 }
 
-/// A message in the hands of whoever sends it.
+/// A message that this process has claimed for sending.
 #[derive(Clone)]
 pub struct DeliveryClaim {
-    /// Whose webhook it goes to.
+    /// The organisation of the webhook.
     pub organisation: OrganisationId,
     pub delivery: Delivery,
     pub url: String,
@@ -149,11 +142,11 @@ pub struct DeliveryClaim {
     pub job: Job,
 }
 
-/// What became of a message that was sent.
+/// Outcome of an attempt to send a message.
 #[derive(Debug, Clone)]
 pub enum Sent {
     Arrived,
-    /// To be tried again from `at`, unless that was the last time.
+    /// Sent again from `at`, unless that was the last attempt.
     Failed {
         error: String,
         at: Timestamp,
@@ -169,17 +162,17 @@ pub trait WebhookStore: Send + Sync + 'static {
     async fn webhook(&self, organisation: OrganisationId, id: WebhookId) -> Result<Option<Webhook>, StoreError>;
     /// An organisation's webhooks in the order of their creation.
     async fn webhooks(&self, organisation: OrganisationId, page: Page) -> Result<Vec<Webhook>, StoreError>;
-    /// Deletes a webhook with its messages; whether there was one.
+    /// Deletes a webhook with its messages; `false` where there was none.
     async fn delete_webhook(&self, organisation: OrganisationId, id: WebhookId) -> Result<bool, StoreError>;
 
-    /// A webhook's messages, or those in one state, the newest first.
+    /// A webhook's messages, optionally in one state, newest first.
     async fn deliveries(
         &self,
         webhook: WebhookId,
         state: Option<DeliveryState>,
         page: Page,
     ) -> Result<Vec<Delivery>, StoreError>;
-    /// Has a message sent anew, as often tried as a new one, whether it arrived, was given up or waits.
+    /// Queues a message in any state for sending again, with all attempts.
     async fn resend_delivery(
         &self,
         webhook: WebhookId,
@@ -187,17 +180,17 @@ pub trait WebhookStore: Send + Sync + 'static {
         now: Timestamp,
     ) -> Result<Option<Delivery>, StoreError>;
 
-    /// Takes the message that is due for the longest time, those to webhooks of `busy` organisations apart. Where it is not
-    /// said within `lease` what became of it, it is taken again.
+    /// Claims the message that has been due for the longest time, except those of `busy` organisations. Without an outcome within
+    /// `lease` it is claimed again.
     async fn claim_delivery(
         &self,
         busy: &[OrganisationId],
         lease: Duration,
         now: Timestamp,
     ) -> Result<Option<DeliveryClaim>, StoreError>;
-    /// Notes what became of a message; `false` where it was taken again, or is gone.
+    /// Records the outcome of an attempt; `false` where the message was claimed again or deleted.
     async fn end_delivery(&self, claim: &DeliveryClaim, sent: &Sent, now: Timestamp) -> Result<bool, StoreError>;
-    /// Forgets messages that arrived, or were given up, before a time.
+    /// Deletes messages that were delivered, or failed for good, before a time.
     async fn forget_old_deliveries(&self, before: Timestamp) -> Result<(), StoreError>;
 }
 

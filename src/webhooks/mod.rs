@@ -1,65 +1,12 @@
-//! Messages to other services: that a job has ended. The store writes them together with the job's end; here they are sent,
-//! signed, until they arrive or were tried often enough.
+//! Messages to other services: that a job has ended. The store creates them in the transaction that ends the job; here they
+//! are signed and sent, until they arrive or have used up their attempts.
 
+pub mod message;
 pub mod sender;
 pub mod signature;
 pub mod target;
 
+pub use message::{Failure, Message};
 pub use sender::{Sender, SenderSettings};
 pub use signature::{HEADER, sign};
 pub use target::{TargetError, Targets};
-
-use crate::store::{DeliveryClaim, DeliveryId, JobId, SurveyId};
-use heliomap_model::PlantId;
-use jiff::Timestamp;
-use serde::Serialize;
-
-/// What is sent: that a job has ended. What else there is to know of it, the API tells.
-#[derive(Debug, Serialize)]
-pub struct Message {
-    /// The same however often it is sent: who has it already may pass over it.
-    pub id: DeliveryId,
-    /// `job.succeeded`, `job.failed` or `job.cancelled`.
-    pub event: String,
-    /// When the job ended.
-    pub at: Timestamp,
-    pub plant: PlantId,
-    pub survey: SurveyId,
-    pub job: JobId,
-    /// The path of the job in the API.
-    pub job_path: String,
-    /// The version of the model that it made.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub model_version: Option<u32>,
-    /// The path of that model in the API.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub model_path: Option<String>,
-    /// Why it failed: the code and the message of the job.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub error: Option<Failure>,
-}
-
-/// Why a job failed.
-#[derive(Debug, Serialize)]
-pub struct Failure {
-    pub code: String,
-    pub message: String,
-}
-
-impl From<&DeliveryClaim> for Message {
-    fn from(claim: &DeliveryClaim) -> Self {
-        let (delivery, job) = (&claim.delivery, &claim.job);
-        Self {
-            id: delivery.id,
-            event: format!("job.{}", job.state.as_str()),
-            at: job.finished.unwrap_or(delivery.created),
-            plant: job.plant,
-            survey: job.survey,
-            job: job.id,
-            job_path: format!("/api/v1/plants/{}/jobs/{}", job.plant, job.id),
-            model_version: job.model_version,
-            model_path: job.model_version.map(|version| format!("/api/v1/plants/{}/models/{version}", job.plant)),
-            error: job.error.clone().map(|(code, message)| Failure { code, message }),
-        }
-    }
-}

@@ -1,7 +1,9 @@
-//! Sends messages: each process that serves or works takes those that are due, under a lease, so that no two send the same
-//! at once and none is lost with the process that had it.
+//! Sends messages. Each server and worker process claims due messages under a lease, so that no two processes send the same
+//! message at once and none is lost with its process.
 
-use super::{HEADER, Message, Targets, sign};
+use super::message::Message;
+use super::signature::{HEADER, sign};
+use super::target::Targets;
 use crate::store::{DeliveryClaim, OrganisationId, Sent, Store};
 use crate::telemetry::Metrics;
 use crate::telemetry::metrics::OutcomeLabels;
@@ -13,12 +15,12 @@ use std::time::Duration;
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 
-/// How many messages one process sends at once.
-const AT_ONCE: usize = 32;
-/// How many of these to webhooks of one organisation, whose slow receivers keep nobody else waiting.
-const AT_ONCE_OF_ONE: usize = 2;
-/// The longest time between two tries.
-const LONGEST_PAUSE: Duration = Duration::from_secs(6 * 3600);
+/// Maximum number of messages that one process sends at the same time.
+const MAX_IN_FLIGHT: usize = 32;
+/// Maximum number of these for one organisation, so that its slow receivers do not delay others.
+const MAX_IN_FLIGHT_PER_ORGANISATION: usize = 2;
+/// Maximum pause between two attempts.
+const MAX_PAUSE: Duration = Duration::from_secs(6 * 3600);
 
 /// A sender's times.
 #[derive(Debug, Clone, Copy)]
@@ -27,9 +29,9 @@ pub struct SenderSettings {
     pub poll: Duration,
     /// How long a receiver may take to answer.
     pub timeout: Duration,
-    /// How long a message stays in the hands of who took it; far above `timeout`.
+    /// How long a claimed message is not claimed again; far above `timeout`.
     pub lease: Duration,
-    /// How long after a first failure a message is tried again; five times as long after each further one, up to six hours.
+    /// Pause after a first failure; five times as long after each further one, up to [`MAX_PAUSE`].
     pub backoff: Duration,
 }
 
@@ -55,10 +57,10 @@ pub struct Sender {
 }
 
 impl Sender {
-    /// One that sends to these targets.
+    /// A sender to these targets.
     ///
     /// # Errors
-    /// Where the system gives no certificates to check receivers by.
+    /// No certificates of authorities on this system.
     pub fn new(
         store: Arc<dyn Store>,
         targets: Targets,
@@ -69,7 +71,7 @@ impl Sender {
         let client = Client::builder()
             .user_agent(concat!("heliomap/", env!("CARGO_PKG_VERSION")))
             .timeout(settings.timeout)
-            // A redirection, or a proxy, would lead past what is checked here.
+            // A redirection or a proxy would bypass the check of addresses.
             .redirect(redirect::Policy::none())
             .no_proxy()
             .dns_resolver(targets)
@@ -77,14 +79,16 @@ impl Sender {
         Ok(Self { store, targets, settings, metrics, client })
     }
 
-    /// Sends what is due until `stop`; what is being sent then may end.
+    /// Sends due messages until `stop`, then waits for those being sent.
     pub async fn run(&self, stop: CancellationToken) {
         let mut sending = JoinSet::new();
         let mut of: HashMap<OrganisationId, usize> = HashMap::new();
         while !stop.is_cancelled() {
-            while sending.len() < AT_ONCE {
-                let busy =
-                    of.iter().filter(|(_, count)| **count >= AT_ONCE_OF_ONE).map(|(organisation, _)| *organisation);
+            while sending.len() < MAX_IN_FLIGHT {
+                let busy = of
+                    .iter()
+                    .filter(|(_, count)| **count >= MAX_IN_FLIGHT_PER_ORGANISATION)
+                    .map(|(organisation, _)| *organisation);
                 let busy: Vec<_> = busy.collect();
                 match self.store.claim_delivery(&busy, self.settings.lease, Timestamp::now()).await {
                     Ok(Some(claim)) => {
@@ -97,7 +101,7 @@ impl Sender {
                     }
                     Ok(None) => break,
                     Err(error) => {
-                        tracing::error!(%error, "cannot look for messages to webhooks");
+                        tracing::error!(%error, "cannot claim messages to webhooks");
                         break;
                     }
                 }
@@ -109,7 +113,7 @@ impl Sender {
                         let left = of.remove(&organisation).unwrap_or_default().saturating_sub(1);
                         of.extend((left > 0).then_some((organisation, left)));
                     }
-                    // Nothing is known of whose it was.
+                    // The organisation of a panicked task is unknown: count anew.
                     Err(error) => {
                         tracing::error!(%error, "a message to a webhook was not sent");
                         while sending.join_next().await.is_some() {}
@@ -122,7 +126,7 @@ impl Sender {
         while sending.join_next().await.is_some() {}
     }
 
-    /// Sends one message and notes what became of it.
+    /// Sends one message and records the result.
     async fn deliver(&self, claim: DeliveryClaim) {
         let sent = match self.send(&claim).await {
             Ok(()) => Sent::Arrived,
@@ -137,37 +141,37 @@ impl Sender {
         let (webhook, delivery) = (claim.delivery.webhook, claim.delivery.id);
         tracing::info!(%webhook, %delivery, outcome, attempt = claim.delivery.attempts, "message to a webhook");
         if let Err(error) = self.store.end_delivery(&claim, &sent, Timestamp::now()).await {
-            // The lease runs out and it is sent again.
-            tracing::error!(%error, %delivery, "cannot note what became of a message to a webhook");
+            // The lease expires and it is sent again.
+            tracing::error!(%error, %delivery, "cannot record the result of a message to a webhook");
         }
     }
 
     /// How long to wait after a failure.
     fn pause(&self, attempts_left: u32) -> Duration {
         let failed_before = crate::store::webhooks::MAX_ATTEMPTS.saturating_sub(attempts_left + 1);
-        self.settings.backoff.saturating_mul(5_u32.saturating_pow(failed_before)).min(LONGEST_PAUSE)
+        self.settings.backoff.saturating_mul(5_u32.saturating_pow(failed_before)).min(MAX_PAUSE)
     }
 
-    /// Why a message did not arrive, where it did not. Of the answer nothing but its status is read.
+    /// Sends a message; the error says why it did not arrive. Only the status of the answer is read.
     async fn send(&self, claim: &DeliveryClaim) -> Result<(), String> {
         let url = self.targets.check(&claim.url).map_err(|error| error.to_string())?;
         let message = Message::from(claim);
         let body = serde_json::to_vec(&message).map_err(|error| error.to_string())?;
         let signature = sign(&claim.secret, Timestamp::now(), &body);
         let request = self.client.post(url).header("content-type", "application/json").header(HEADER, signature);
-        let answer = request.body(body).send().await.map_err(|error| told(&error))?;
+        let answer = request.body(body).send().await.map_err(|error| reason(&error))?;
         match answer.status() {
             status if status.is_success() => Ok(()),
             status if status.is_redirection() => {
-                Err(format!("the receiver answered {status}; redirections are not followed: register where they lead"))
+                Err(format!("the receiver answered {status}; redirections are not followed: register their target"))
             }
             status => Err(format!("the receiver answered {status}")),
         }
     }
 }
 
-/// What failed, without the URL.
-fn told(error: &reqwest::Error) -> String {
+/// Why a request failed, without its URL.
+fn reason(error: &reqwest::Error) -> String {
     if error.is_timeout() {
         return "the receiver did not answer in time".to_owned();
     }

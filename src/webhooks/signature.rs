@@ -1,5 +1,4 @@
-//! How messages are signed: HMAC-SHA256 (RFC 2104) over the time and the body, so that a receiver knows who sent them and
-//! that they are not sent again by someone who overheard them.
+//! Signatures of messages: HMAC-SHA256 (RFC 2104) over time and body. A receiver can check the sender and refuse replays.
 
 use crate::store::SigningSecret;
 use jiff::Timestamp;
@@ -12,7 +11,7 @@ fn key(secret: &SigningSecret) -> hmac::Key {
     hmac::Key::new(hmac::HMAC_SHA256, secret.reveal().as_bytes())
 }
 
-/// What is signed.
+/// The bytes that are signed.
 fn signed(seconds: i64, body: &[u8]) -> Vec<u8> {
     [format!("{seconds}.").as_bytes(), body].concat()
 }

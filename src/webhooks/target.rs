@@ -1,6 +1,6 @@
-//! Where messages may go. Whoever registers a webhook chooses an address that this service then connects to from within its
-//! own network: unless whoever runs it says otherwise, only public addresses are taken, as they are found when the
-//! connection is made, since a name may lead elsewhere by then.
+//! Where messages may go. A webhook names an address that this service then connects to from within its own network (server-side
+//! request forgery). By default only public addresses are accepted. They are checked when the connection is made, since
+//! a name may resolve to another address by then.
 
 use reqwest::Url;
 use reqwest::dns::{Addrs, Name, Resolve, Resolving};
@@ -30,13 +30,18 @@ pub enum TargetError {
     NotHttps,
     #[error("the URL holds a user name or a password; put a secret into its path or rely on the signature")]
     Credentials,
-    #[error("the URL leads to {0}, which is no public address")]
+    #[error("the URL leads to {0}, which is not a public address")]
     Private(IpAddr),
     #[error("{0} leads to no public address")]
     PrivateName(String),
 }
 
 impl Targets {
+    /// Public targets alone, or private ones as well.
+    pub fn allowing_private(private: bool) -> Self {
+        if private { Self::Any } else { Self::Public }
+    }
+
     /// Reads a URL that messages may go to. A name is looked up only when a message is sent.
     pub fn check(self, url: &str) -> Result<Url, TargetError> {
         if url.len() > MAX_URL_BYTES {
@@ -204,7 +209,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn names_that_lead_here_are_refused() {
+    async fn names_of_this_machine_are_refused() {
         let resolve = |targets: Targets| targets.resolve("localhost".parse().unwrap());
         let refused = resolve(Targets::Public).await.err().unwrap().to_string();
         assert_eq!(refused, "localhost leads to no public address");

@@ -60,7 +60,7 @@ pub struct ScriptedMapper {
 }
 
 impl Mapper for ScriptedMapper {
-    fn map(
+    fn run(
         &self,
         folder: &dyn ProjectFolder,
         options: &MapOptions,
@@ -225,8 +225,8 @@ fn worker(store: Arc<dyn Store>, blobs: Blobs, mapper: Arc<dyn Mapper>) -> Worke
         poll: Duration::from_millis(20),
         backoff: Duration::from_millis(10),
     };
-    let (name, metrics, bell) = ("test".to_owned(), Metrics::default(), Arc::default());
-    Worker { name, store, blobs, mapper, settings, metrics, bell }
+    let (name, metrics, work_notify) = ("test".to_owned(), Metrics::default(), Arc::default());
+    Worker { name, store, blobs, mapper, settings, metrics, work_notify }
 }
 
 /// A service over what another one has stored, which lives at least as long.
@@ -392,17 +392,18 @@ impl App {
         let folder = tempfile::tempdir().unwrap();
         let store: Arc<dyn Store> = Arc::new(SqliteStore::open(&folder.path().join("heliomap.db")).await.unwrap());
         let blobs = Blobs::in_folder(folder.path()).unwrap();
-        let (bell, metrics) = (Arc::new(Notify::new()), Metrics::default());
+        let (work_notify, metrics) = (Arc::new(Notify::new()), Metrics::default());
         if let Some(mapper) = working {
             let worker = worker(store.clone(), blobs.clone(), mapper);
-            let (worker, stop) = (Worker { metrics: metrics.clone(), bell: bell.clone(), ..worker }, cancelled.clone());
+            let (worker, stop) =
+                (Worker { metrics: metrics.clone(), work_notify: work_notify.clone(), ..worker }, cancelled.clone());
             tokio::spawn(async move { worker.run(stop).await });
         }
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
         let base = format!("http://{}", listener.local_addr().unwrap());
         let served = limits.clone();
         let state = AppState {
-            bell,
+            bell: work_notify,
             metrics: metrics.clone(),
             insecure,
             stop: cancelled.clone(),

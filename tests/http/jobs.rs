@@ -36,7 +36,10 @@ async fn a_photo_that_the_storage_does_not_give_is_asked_for_again() {
         (&job["state"], &job["attempt"], &job["error"]["code"]),
         (&json!("failed"), &json!(3), &json!("environment"))
     );
-    assert_eq!(job["error"]["message"], "a.jpg cannot be fetched: the service's storage failed; its log says more");
+    assert_eq!(
+        job["error"]["message"],
+        "a.jpg cannot be fetched: the service's storage failed; see the log of the service"
+    );
     std::fs::write(&blob, jpeg(32, 24)).unwrap();
     assert_eq!(app.map(&survey).await["state"], "succeeded");
 }

@@ -234,7 +234,7 @@ async fn every_other_token_lets_nobody_in() {
         (with("iss", json!("https://evil.example.org")), "is not of http://"),
         (with("aud", json!("another")), "is not for heliomap"),
         (with("exp", json!(now - 60)), "has expired"),
-        (with("nbf", json!(now + 60)), "does not hold yet"),
+        (with("nbf", json!(now + 60)), "is not valid yet"),
         (with("sub", json!("")), "names no subject"),
         (with("organisation", json!(7)), "names no organisation"),
         (without("exp"), "lacks the claim exp"),
@@ -244,10 +244,10 @@ async fn every_other_token_lets_nobody_in() {
         (forged("none", &|_| Vec::new()), "cannot be read"),
         (forged("HS256", &by_public_key), "is not signed by RS256"),
         (forged("PS256", &|message| rsa.sign(message)), "is not signed by RS256"),
-        (forged("ES256", &|message| ec.sign(message)), "a key that the provider does not have"),
-        (rsa.token("e", &good), "a key that the provider does not have"),
-        (rsa.token("unknown", &good), "a key that the provider does not have"),
-        (Key::rsa(RSA_OF_STRANGER).token("r", &good), "a signature that does not hold"),
+        (forged("ES256", &|message| ec.sign(message)), "a key that the provider does not publish"),
+        (rsa.token("e", &good), "a key that the provider does not publish"),
+        (rsa.token("unknown", &good), "a key that the provider does not publish"),
+        (Key::rsa(RSA_OF_STRANGER).token("r", &good), "an invalid signature"),
         (changed, "the token"),
         ("a.b.c".to_owned(), "cannot be read"),
         (format!("{}.b.c", "a".repeat(20_000)), "longer than"),
@@ -284,7 +284,7 @@ async fn a_provider_that_falls_silent_keeps_nobody_waiting_and_its_keys_hold_for
     let key = Key::ed();
     let provider = Provider::new(vec![key.jwk("1")]).await;
     let (claims, wait) = (provider.claims(), Duration::from_secs(2));
-    let old = Ages { min_refresh: Duration::ZERO, fresh: Duration::ZERO, most: Duration::from_secs(3600) };
+    let old = Ages { min_refresh: Duration::ZERO, fresh: Duration::ZERO, max: Duration::from_secs(3600) };
     let oidc = provider.oidc_with(old);
     assert!(oidc.bearer(&key.token("1", &claims)).await.is_ok());
     provider.silent.store(true, Ordering::Relaxed);
@@ -294,12 +294,12 @@ async fn a_provider_that_falls_silent_keeps_nobody_waiting_and_its_keys_hold_for
     }
 
     provider.silent.store(false, Ordering::Relaxed);
-    let most = Duration::from_secs(1);
-    let oidc = provider.oidc_with(Ages { most, ..old });
+    let max = Duration::from_secs(1);
+    let oidc = provider.oidc_with(Ages { max, ..old });
     assert!(oidc.bearer(&key.token("1", &claims)).await.is_ok());
     *provider.issuer.lock().unwrap() = "http://127.0.0.1:9".to_owned();
     assert!(oidc.bearer(&key.token("1", &claims)).await.is_ok());
-    tokio::time::sleep(most).await;
+    tokio::time::sleep(max).await;
     let error = oidc.bearer(&key.token("1", &claims)).await.unwrap_err();
     assert!(matches!(error, OidcError::Unavailable(_)), "{error}");
 }

@@ -234,7 +234,7 @@ async fn an_upload_goes_on_at_another_server() {
     here.bring_pieces(id, 18_000_000, &second, room).await.unwrap();
     assert!(file_of(here) == bytes);
 
-    // Once nobody knows it, its pieces go.
+    // Pieces of unknown uploads are deleted.
     let is_there = async || there.bring_pieces(id, 0, &second, room).await.is_ok();
     there.sweep_uploads(HashSet::from([id]), Duration::ZERO).await.unwrap();
     assert!(is_there().await);

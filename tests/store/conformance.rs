@@ -1,6 +1,7 @@
-//! The suite. Times are given, so nothing waits.
+//! The suite. Times are parameters, so that nothing waits.
 
 mod access;
+pub mod cancelled;
 pub mod contention;
 mod files;
 mod freeing;

@@ -1,11 +1,11 @@
-//! What every store must do, whichever database is behind it, and every blob store, wherever its bytes lie.
+//! Conformance of stores on both databases, and of blob stores on disk and in a bucket.
 
 mod blobs;
 mod conformance;
 
 use heliomap::store::{PostgresStore, SqliteStore};
 
-/// Runs the whole suite on every database, on a store of its own per test.
+/// Runs the suite on both databases, each test on a store of its own.
 macro_rules! on_both {
     ($($name:ident),* $(,)?) => {
         mod sqlite {
@@ -59,13 +59,13 @@ on_both!(
     uploads,
     one_unfinished_job_per_survey,
     jobs_of_one_plant_run_one_after_the_other,
-    an_abandoned_job_is_taken_up_and_its_first_worker_is_fenced_out,
+    abandoned_jobs_are_claimed_again_and_their_first_worker_is_fenced,
     a_job_that_kills_its_workers_ends,
-    a_released_job_has_its_attempt_back,
+    released_jobs_get_their_attempt_back,
     retry_waits_and_ends,
-    the_pause_before_a_retry_grows_while_the_job_gets_nowhere,
-    a_job_that_a_worker_cannot_do_waits_for_another,
-    what_is_cancelled_does_not_go_back_to_the_queue,
+    the_pause_before_a_retry_grows_without_progress,
+    declined_jobs_wait_for_another_worker,
+    cancelled_jobs_do_not_return_to_the_queue,
     checkpoints_live_as_long_as_their_job,
     jobs_by_priority,
     the_last_jobs_pace_is_known,
@@ -77,30 +77,108 @@ on_both!(
     a_deleted_plant_takes_everything_with_it,
     boxes_find_what_touches_them,
     quotas,
-    a_file_is_replaced_only_where_it_is_as_wanted,
+    files_are_replaced_only_if_the_precondition_holds,
     lists_are_filtered,
     webhooks,
-    messages_are_sent_by_one_at_a_time_and_not_for_ever,
-    messages_of_a_busy_organisation_keep_no_other_waiting,
-    blobs_that_rows_name,
-    what_nothing_names_any_more_is_freed,
-    bytes_that_come_again_are_kept,
-    a_model_that_no_row_came_to_name_is_freed,
-    bytes_that_a_job_may_read_are_kept,
-    the_last_name_counts_whoever_is_last,
-    images_of_a_job_are_shared,
-    images_in_silent_hands_come_back,
-    images_go_with_their_job,
+    messages_are_claimed_once_and_have_limited_attempts,
+    busy_organisations_do_not_delay_messages_of_others,
+    referenced_blobs_are_listed,
+    unreferenced_blobs_are_freed,
+    blobs_that_are_uploaded_again_are_kept,
+    unreferenced_models_are_freed,
+    blobs_that_a_running_job_may_read_are_kept,
+    blobs_are_kept_until_the_last_reference_is_gone,
+    tasks_are_shared_among_workers,
+    tasks_of_silent_workers_are_claimed_again,
+    tasks_are_deleted_with_their_job,
 );
 
-/// Workers of other processes need not wait until they look.
+/// Workers of other processes need not wait for their next poll.
 #[tokio::test]
 #[ignore = "needs Postgres; run `make unit`"]
-async fn postgres_rings_for_work() {
-    conformance::work_is_told(&postgres_store().await).await;
+async fn postgres_notifies_of_work() {
+    conformance::workers_are_notified(&postgres_store().await).await;
 }
 
-/// What happens where transactions meet.
+/// Callers that go away, on every database; each test has a second store over the same rows.
+macro_rules! cancelled {
+    ($($name:ident),* $(,)?) => {
+        mod cancelled_on_sqlite {
+            $(
+                #[tokio::test]
+                async fn $name() {
+                    let folder = tempfile::tempdir().unwrap();
+                    let file = folder.path().join("heliomap.db");
+                    let store = super::SqliteStore::open(&file).await.unwrap();
+                    let other = super::SqliteStore::open(&file).await.unwrap();
+                    super::conformance::cancelled::$name(&store, &other).await;
+                }
+            )*
+        }
+
+        mod cancelled_on_postgres {
+            $(
+                #[tokio::test]
+                #[ignore = "needs Postgres; run `make unit`"]
+                async fn $name() {
+                    let database = super::postgres_database().await;
+                    let store = super::PostgresStore::open(&database).await.unwrap();
+                    let other = super::PostgresStore::open(&database).await.unwrap();
+                    super::conformance::cancelled::$name(&store, &other).await;
+                }
+            )*
+        }
+    };
+}
+
+cancelled!(
+    a_transaction_cancelled_at_any_await_is_whole_or_not_at_all,
+    a_claim_cancelled_at_any_await_leaves_the_queue_whole,
+    a_statement_cancelled_at_any_await_leaves_the_store_whole,
+);
+
+/// A file that may not grow stands for a disk that is full: every write says so, and once there is room all work again.
+#[tokio::test]
+async fn a_full_disk_is_full_no_longer_than_it_is() {
+    use heliomap::store::{Created, JobStore, OrganisationId, Page, PlantStore, Store, StoreError};
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("heliomap.db");
+    SqliteStore::open(&file).await.unwrap().close().await;
+    let pages = std::fs::metadata(&file).unwrap().len() / 4096;
+    let store = SqliteStore::open_bounded(&file, Some(pages as u32 + 40)).await.unwrap();
+    let now = jiff::Timestamp::UNIX_EPOCH;
+    let create = |name: String| {
+        let store = store.clone();
+        async move { store.create_plant(OrganisationId::DEFAULT, &name, Default::default(), now).await }
+    };
+    store.try_to_write().await.unwrap();
+    let mut made = Vec::new();
+    let full: StoreError = loop {
+        match create(format!("{} {}", made.len(), "long ".repeat(200))).await {
+            Ok(Created::New(plant)) => made.push(plant.id),
+            Ok(Created::Existing(_)) => unreachable!("the names differ"),
+            Err(error) => break error,
+        }
+    };
+    assert!(full.is_full(), "{full}");
+    // Not once, and not only the statement that met it.
+    for attempt in 0..20 {
+        let error = create(format!("more {attempt} {}", "long ".repeat(200))).await.unwrap_err();
+        assert!(error.is_full(), "{error}");
+        let error = store.try_to_write().await.unwrap_err();
+        assert!(error.is_full(), "{error}");
+        assert!(store.claim_job("worker", std::time::Duration::from_secs(9), now).await.unwrap().is_none());
+    }
+    let all = Page { after: None, limit: 1000 };
+    assert_eq!(store.plants(OrganisationId::DEFAULT, None, "", all).await.unwrap().len(), made.len());
+    for plant in &made {
+        assert!(store.delete_plant(*plant, now).await.unwrap());
+    }
+    store.try_to_write().await.unwrap();
+    assert!(matches!(create("room again".to_owned()).await.unwrap(), Created::New(_)));
+}
+
+/// Concurrent transactions.
 macro_rules! on_postgres {
     ($($name:ident),* $(,)?) => {
         mod contention {
@@ -124,13 +202,13 @@ on_postgres!(
     an_image_that_is_just_found_is_not_taken_again,
     heartbeats_go_on_while_a_model_is_stored,
     an_image_that_is_found_as_its_job_ends_holds_up_neither,
-    an_end_that_comes_too_late_is_told_to_nobody,
+    a_late_end_creates_no_message,
 );
 
-/// A data folder of before there were organisations keeps all that it holds.
+/// Data folders from before organisations existed.
 #[tokio::test]
-async fn what_was_there_before_is_kept() {
-    use heliomap::store::{OrganisationId, Page, Store};
+async fn data_from_before_organisations_is_kept() {
+    use heliomap::store::{OrganisationId, Page, PlantStore, SurveyStore};
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("heliomap.db");
     let options = sqlx::sqlite::SqliteConnectOptions::new().filename(&file).create_if_missing(true);
@@ -160,7 +238,7 @@ async fn what_was_there_before_is_kept() {
 
 #[tokio::test]
 async fn rows_survive_the_process_and_two_may_open_at_once() {
-    use heliomap::store::{Created, OrganisationId, Store};
+    use heliomap::store::{Created, OrganisationId, PlantStore};
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("heliomap.db");
     let (first, second) = tokio::join!(SqliteStore::open(&file), SqliteStore::open(&file));
@@ -176,4 +254,37 @@ async fn rows_survive_the_process_and_two_may_open_at_once() {
         again.create_plant(OrganisationId::DEFAULT, "A", Default::default(), now).await.unwrap(),
         Created::Existing(_)
     ));
+}
+
+/// Records a change of the schema that no version knows yet, as a newer version would.
+const NEWER_CHANGE: &str = "INSERT INTO _sqlx_migrations (version, description, success, checksum, execution_time) \
+    SELECT 999999, 'newer', success, checksum, 0 FROM _sqlx_migrations WHERE version = 60";
+
+/// A process that still runs while a newer version upgrades the database neither takes nor gives work.
+#[tokio::test]
+async fn sqlite_refuses_a_newer_schema() {
+    use heliomap::store::StoreError;
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("heliomap.db");
+    let store = SqliteStore::open(&file).await.unwrap();
+    let pool = sqlx::SqlitePool::connect(&format!("sqlite://{}", file.display())).await.unwrap();
+    conformance::a_newer_schema_is_refused(&store, async || {
+        sqlx::query(NEWER_CHANGE).execute(&pool).await.unwrap();
+    })
+    .await;
+    assert!(matches!(SqliteStore::open(&file).await, Err(StoreError::NewerSchema { change: 999_999 })));
+}
+
+#[tokio::test]
+#[ignore = "needs Postgres; run `make unit`"]
+async fn postgres_refuses_a_newer_schema() {
+    use heliomap::store::StoreError;
+    let database = postgres_database().await;
+    let store = PostgresStore::open(&database).await.unwrap();
+    let pool = sqlx::PgPool::connect(&database).await.unwrap();
+    conformance::a_newer_schema_is_refused(&store, async || {
+        sqlx::query(NEWER_CHANGE).execute(&pool).await.unwrap();
+    })
+    .await;
+    assert!(matches!(PostgresStore::open(&database).await, Err(StoreError::NewerSchema { change: 999_999 })));
 }

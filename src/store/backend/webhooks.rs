@@ -1,28 +1,51 @@
 //! Webhooks and the messages to them.
 
-use super::super::{Rows, Tx, queues};
-use super::read::{self, delivery, job, webhook};
-use crate::store::webhooks::{MAX_ATTEMPTS, MAX_WEBHOOKS, SigningSecret};
-use crate::store::{
-    Delivery, DeliveryClaim, DeliveryId, DeliveryState, JobId, NewWebhook, OrganisationId, Page, Sent, StoreError,
-    Webhook, WebhookId, WebhookStore, sql,
+use super::super::{Row, Rows};
+use super::columns::{optional_time, parsed, small, time, uuid};
+use super::{after, gone, jobs};
+use crate::store::error::StoreError;
+use crate::store::ids::{DeliveryId, JobId, OrganisationId, WebhookId};
+use crate::store::listing::Page;
+use crate::store::webhooks::{
+    Delivery, DeliveryClaim, DeliveryState, MAX_ATTEMPTS, MAX_WEBHOOKS, NewWebhook, Sent, SigningSecret, Webhook,
+    WebhookStore,
 };
 use async_trait::async_trait;
+use heliomap_model::PlantId;
 use jiff::Timestamp;
 use sqlx::Row as _;
 use std::time::Duration;
 use uuid::Uuid;
 
+macro_rules! webhook_columns {
+    () => {
+        "seq, id, organisation_id, plant_id, url, created_ms"
+    };
+}
+
+macro_rules! delivery_columns {
+    () => {
+        "seq, id, webhook_id, job_id, state, attempts, attempts_left, run_after_ms, error, created_ms, finished_ms"
+    };
+}
+
 #[async_trait]
 impl WebhookStore for Rows {
     async fn create_webhook(&self, new: &NewWebhook, now: Timestamp) -> Result<Option<Webhook>, StoreError> {
+        const COUNT_WEBHOOKS: &str = "SELECT COUNT(*) FROM webhooks WHERE organisation_id = $1";
+        const CREATE_WEBHOOK: &str = concat!(
+            "INSERT INTO webhooks (id, organisation_id, plant_id, url, secret, created_ms) VALUES ($1, $2, $3, $4, $5, $6) \
+             RETURNING ",
+            webhook_columns!()
+        );
         let mut tx = self.begin().await?;
         let count: i64 =
-            sqlx::query_scalar(sql::COUNT_WEBHOOKS).bind(new.organisation.to_string()).fetch_one(&mut *tx).await?;
+            sqlx::query_scalar(COUNT_WEBHOOKS).bind(new.organisation.to_string()).fetch_one(&mut *tx).await?;
         if count >= i64::from(MAX_WEBHOOKS) {
+            tx.rollback().await?;
             return Ok(None);
         }
-        let row = sqlx::query(sql::CREATE_WEBHOOK)
+        let row = sqlx::query(CREATE_WEBHOOK)
             .bind(Uuid::new_v4().to_string())
             .bind(new.organisation.to_string())
             .bind(new.plant.map(|plant| plant.to_string()))
@@ -31,18 +54,25 @@ impl WebhookStore for Rows {
             .bind(now.as_millisecond())
             .fetch_one(&mut *tx)
             .await
-            .map_err(super::gone("plant"))?;
+            .map_err(gone("plant"))?;
         tx.commit().await?;
         webhook(&row).map(Some)
     }
 
     async fn webhook(&self, organisation: OrganisationId, id: WebhookId) -> Result<Option<Webhook>, StoreError> {
-        let query = sqlx::query(sql::WEBHOOK).bind(organisation.to_string()).bind(id.to_string());
+        const WEBHOOK: &str =
+            concat!("SELECT ", webhook_columns!(), " FROM webhooks WHERE organisation_id = $1 AND id = $2");
+        let query = sqlx::query(WEBHOOK).bind(organisation.to_string()).bind(id.to_string());
         query.fetch_optional(&self.read).await?.as_ref().map(webhook).transpose()
     }
 
     async fn webhooks(&self, organisation: OrganisationId, page: Page) -> Result<Vec<Webhook>, StoreError> {
-        let query = sqlx::query(sql::WEBHOOKS)
+        const WEBHOOKS: &str = concat!(
+            "SELECT ",
+            webhook_columns!(),
+            " FROM webhooks WHERE organisation_id = $1 AND seq > $2 ORDER BY seq LIMIT $3"
+        );
+        let query = sqlx::query(WEBHOOKS)
             .bind(organisation.to_string())
             .bind(page.after.unwrap_or(0))
             .bind(i64::from(page.limit));
@@ -50,7 +80,8 @@ impl WebhookStore for Rows {
     }
 
     async fn delete_webhook(&self, organisation: OrganisationId, id: WebhookId) -> Result<bool, StoreError> {
-        let query = sqlx::query(sql::DELETE_WEBHOOK).bind(organisation.to_string()).bind(id.to_string());
+        const DELETE_WEBHOOK: &str = "DELETE FROM webhooks WHERE organisation_id = $1 AND id = $2";
+        let query = sqlx::query(DELETE_WEBHOOK).bind(organisation.to_string()).bind(id.to_string());
         Ok(query.execute(&self.write).await?.rows_affected() > 0)
     }
 
@@ -60,7 +91,12 @@ impl WebhookStore for Rows {
         state: Option<DeliveryState>,
         page: Page,
     ) -> Result<Vec<Delivery>, StoreError> {
-        let query = sqlx::query(sql::DELIVERIES)
+        const DELIVERIES: &str = concat!(
+            "SELECT ",
+            delivery_columns!(),
+            " FROM deliveries WHERE webhook_id = $1 AND state = COALESCE($2, state) AND seq < $3 ORDER BY seq DESC LIMIT $4"
+        );
+        let query = sqlx::query(DELIVERIES)
             .bind(webhook.to_string())
             .bind(state.map(DeliveryState::as_str))
             .bind(page.after.unwrap_or(i64::MAX))
@@ -74,7 +110,12 @@ impl WebhookStore for Rows {
         id: DeliveryId,
         now: Timestamp,
     ) -> Result<Option<Delivery>, StoreError> {
-        let query = sqlx::query(sql::RESEND_DELIVERY)
+        const RESEND_DELIVERY: &str = concat!(
+            "UPDATE deliveries SET state = 'waiting', attempts_left = $4, run_after_ms = $3, finished_ms = NULL \
+             WHERE webhook_id = $1 AND id = $2 RETURNING ",
+            delivery_columns!()
+        );
+        let query = sqlx::query(RESEND_DELIVERY)
             .bind(webhook.to_string())
             .bind(id.to_string())
             .bind(now.as_millisecond())
@@ -88,26 +129,48 @@ impl WebhookStore for Rows {
         lease: Duration,
         now: Timestamp,
     ) -> Result<Option<DeliveryClaim>, StoreError> {
-        // Mostly there is none: finding that out takes no turn from those who write.
-        let due = sqlx::query(sql::DELIVERY_DUE).bind(now.as_millisecond()).fetch_optional(&self.read).await?;
+        const DELIVERY_DUE: &str = "SELECT 1 FROM deliveries WHERE state = 'waiting' AND run_after_ms <= $1 LIMIT 1";
+        /// `$3` is the JSON array of the organisations that are passed over.
+        const CLAIM_DELIVERY: &str = concat!(
+            "UPDATE deliveries SET attempts = attempts + 1, run_after_ms = $2, \
+             attempts_left = CASE WHEN attempts_left > 0 THEN attempts_left - 1 ELSE 0 END \
+             WHERE state = 'waiting' AND run_after_ms <= $1 AND seq = (SELECT candidate.seq \
+             FROM deliveries AS candidate JOIN webhooks ON webhooks.id = candidate.webhook_id \
+             WHERE candidate.state = 'waiting' AND candidate.run_after_ms <= $1 \
+             AND webhooks.organisation_id NOT IN ",
+            json_texts!("$3"),
+            " ORDER BY candidate.run_after_ms, candidate.seq LIMIT 1",
+            skip_locked!(),
+            ") RETURNING ",
+            delivery_columns!()
+        );
+        const WEBHOOK_OF_DELIVERY: &str = "SELECT organisation_id, url, secret FROM webhooks WHERE id = $1";
+        // Mostly there is none: find that out without a lock.
+        let due = sqlx::query(DELIVERY_DUE).bind(now.as_millisecond()).fetch_optional(&self.read).await?;
         if due.is_none() {
             return Ok(None);
         }
         let mut tx = self.begin().await?;
-        let busy: Vec<String> = busy.iter().map(OrganisationId::to_string).collect();
-        let query = sqlx::query(queues::CLAIM_DELIVERY).bind(now.as_millisecond()).bind(super::after(now, lease));
-        let Some(row) = query.bind(busy.join(" ")).fetch_optional(&mut *tx).await? else { return Ok(None) };
+        let query = sqlx::query(CLAIM_DELIVERY).bind(now.as_millisecond()).bind(after(now, lease));
+        let Some(row) = query.bind(serde_json::json!(busy).to_string()).fetch_optional(&mut *tx).await? else {
+            tx.rollback().await?;
+            return Ok(None);
+        };
         let delivery = delivery(&row)?;
-        let to = sqlx::query(sql::WEBHOOK_OF_DELIVERY).bind(delivery.webhook.to_string()).fetch_one(&mut *tx).await?;
-        let of = sqlx::query(sql::JOB_OF_DELIVERY).bind(delivery.job.to_string()).fetch_one(&mut *tx).await?;
+        let to = sqlx::query(WEBHOOK_OF_DELIVERY).bind(delivery.webhook.to_string()).fetch_one(&mut *tx).await?;
+        let job = jobs::job_by_id(&mut tx, delivery.job).await?;
         let secret = SigningSecret::kept(to.try_get("secret")?);
-        let organisation = OrganisationId(read::uuid(&to, "organisation_id")?);
-        let claim = DeliveryClaim { organisation, delivery, url: to.try_get("url")?, secret, job: job(&of)? };
+        let organisation = OrganisationId(uuid(&to, "organisation_id")?);
+        let claim = DeliveryClaim { organisation, delivery, url: to.try_get("url")?, secret, job };
         tx.commit().await?;
         Ok(Some(claim))
     }
 
     async fn end_delivery(&self, claim: &DeliveryClaim, sent: &Sent, now: Timestamp) -> Result<bool, StoreError> {
+        /// `$2` the attempt, `$3` the state, `$4` the error, `$5` the time of the next attempt, `$6` the time of the end.
+        const END_DELIVERY: &str = "\
+            UPDATE deliveries SET state = $3, error = $4, run_after_ms = COALESCE($5, run_after_ms), finished_ms = $6 \
+            WHERE id = $1 AND attempts = $2 AND state = 'waiting'";
         let now_ms = Some(now.as_millisecond());
         let (state, error, run_after_ms, finished_ms) = match sent {
             Sent::Arrived => (DeliveryState::Delivered, None, None, now_ms),
@@ -116,7 +179,7 @@ impl WebhookStore for Rows {
             }
             Sent::Failed { error, at } => (DeliveryState::Waiting, Some(error), Some(at.as_millisecond()), None),
         };
-        let query = sqlx::query(sql::END_DELIVERY)
+        let query = sqlx::query(END_DELIVERY)
             .bind(claim.delivery.id.to_string())
             .bind(i64::from(claim.delivery.attempts))
             .bind(state.as_str())
@@ -127,22 +190,36 @@ impl WebhookStore for Rows {
     }
 
     async fn forget_old_deliveries(&self, before: Timestamp) -> Result<(), StoreError> {
-        sqlx::query(sql::FORGET_OLD_DELIVERIES).bind(before.as_millisecond()).execute(&self.write).await?;
+        const FORGET_OLD_DELIVERIES: &str = "DELETE FROM deliveries WHERE finished_ms < $1";
+        sqlx::query(FORGET_OLD_DELIVERIES).bind(before.as_millisecond()).execute(&self.write).await?;
         Ok(())
     }
 }
 
-/// Writes a message to every webhook that wants to hear of the end of a job, which is part of the same transaction.
-pub async fn announce(tx: &mut Tx, job: JobId, now: Timestamp) -> Result<(), StoreError> {
-    for row in sqlx::query(sql::WEBHOOKS_OF_JOB).bind(job.to_string()).fetch_all(&mut **tx).await? {
-        sqlx::query(sql::CREATE_DELIVERY)
-            .bind(Uuid::new_v4().to_string())
-            .bind(read::uuid(&row, "id")?.to_string())
-            .bind(job.to_string())
-            .bind(i64::from(MAX_ATTEMPTS))
-            .bind(now.as_millisecond())
-            .execute(&mut **tx)
-            .await?;
-    }
-    Ok(())
+fn webhook(row: &Row) -> Result<Webhook, StoreError> {
+    let plant: Option<String> = row.try_get("plant_id")?;
+    Ok(Webhook {
+        seq: row.try_get("seq")?,
+        id: WebhookId(uuid(row, "id")?),
+        organisation: OrganisationId(uuid(row, "organisation_id")?),
+        plant: plant.map(|_| uuid(row, "plant_id").map(PlantId)).transpose()?,
+        url: row.try_get("url")?,
+        created: time(row, "created_ms")?,
+    })
+}
+
+fn delivery(row: &Row) -> Result<Delivery, StoreError> {
+    Ok(Delivery {
+        seq: row.try_get("seq")?,
+        id: DeliveryId(uuid(row, "id")?),
+        webhook: WebhookId(uuid(row, "webhook_id")?),
+        job: JobId(uuid(row, "job_id")?),
+        state: parsed(row, "state")?,
+        attempts: small("attempts", row.try_get("attempts")?)?,
+        attempts_left: small("attempts_left", row.try_get("attempts_left")?)?,
+        run_after: time(row, "run_after_ms")?,
+        error: row.try_get("error")?,
+        created: time(row, "created_ms")?,
+        finished: optional_time(row, "finished_ms")?,
+    })
 }

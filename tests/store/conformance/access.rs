@@ -40,8 +40,8 @@ pub async fn organisations_and_their_plants(store: &dyn Store) {
     assert_eq!(ids(a, Some(&[more.id, two.id])).await, [more.id]);
     assert!(ids(a, Some(&[])).await.is_empty());
     assert_eq!(store.plant(two.id).await.unwrap().unwrap().organisation, b);
-    let nobody = store.create_plant(OrganisationId(Uuid::max()), "x", Quotas::default(), at(3)).await;
-    assert!(matches!(nobody, Err(StoreError::Gone { what: "organisation" })));
+    let refused = store.create_plant(OrganisationId(Uuid::max()), "x", Quotas::default(), at(3)).await;
+    assert!(matches!(refused, Err(StoreError::Gone { what: "organisation" })));
 }
 
 pub async fn keys(store: &dyn Store) {

@@ -38,7 +38,7 @@ pub async fn a_job_that_is_just_ending_is_not_claimed_again(store: &dyn Store, p
     let claimed = running(store).await;
     let other = survey(store, plant(store, "B").await.id, "June").await;
     let mut tx = pool.begin().await.unwrap();
-    let ends = "UPDATE jobs SET state = 'succeeded', finished_ms = 1, lease_until_ms = NULL WHERE id = $1";
+    let ends = "UPDATE jobs SET state = 'succeeded', finished_ms = 1, claim_expires_ms = NULL WHERE id = $1";
     sqlx::query(ends).bind(claimed.job.id.to_string()).execute(&mut *tx).await.unwrap();
     // Its lease is over; what else waits is not kept waiting by it.
     assert!(at_once(claim(store, 31)).await.is_none());
@@ -71,7 +71,7 @@ pub async fn an_image_that_is_just_found_is_not_taken_again(store: &dyn Store, p
     // The helper's lease is over.
     let own = at_once(store.take_own_task(&owner, at(31))).await.unwrap();
     assert_eq!(own, OwnTask::Image("b".to_owned()));
-    assert_eq!(at_once(store.take_own_task(&owner, at(31))).await.unwrap(), OwnTask::InOtherHands);
+    assert_eq!(at_once(store.take_own_task(&owner, at(31))).await.unwrap(), OwnTask::HeldByOthers);
     assert!(at_once(store.take_task("v", LEASE, at(31))).await.unwrap().is_none());
     tx.commit().await.unwrap();
     assert!(store.take_task("v", LEASE, at(31)).await.unwrap().is_none());
@@ -115,7 +115,7 @@ pub async fn an_image_that_is_found_as_its_job_ends_holds_up_neither(store: &dyn
     assert!(!found.unwrap());
 }
 
-pub async fn an_end_that_comes_too_late_is_told_to_nobody(store: &dyn Store, pool: &PgPool) {
+pub async fn a_late_end_creates_no_message(store: &dyn Store, pool: &PgPool) {
     let secret = SigningSecret::random().unwrap();
     let new = NewWebhook { organisation: ORGANISATION, plant: None, url: "https://example.org/".to_owned(), secret };
     let webhook = store.create_webhook(&new, at(0)).await.unwrap().unwrap();

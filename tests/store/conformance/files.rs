@@ -21,8 +21,8 @@ pub async fn files_all_or_none(store: &dyn Store) {
     assert_eq!(files[0].sha256, Digest::of(b"other"));
     let found = store.file(survey.id, &files[0].path).await.unwrap().unwrap();
     assert_eq!((found.path, found.photo, found.shots), (files[0].path.clone(), None, None));
-    let nobody = store.put_files(heliomap::store::SurveyId(Uuid::nil()), &[a]).await;
-    assert!(matches!(nobody, Err(StoreError::Gone { what: "survey" })));
+    let refused = store.put_files(heliomap::store::SurveyId(Uuid::nil()), &[a]).await;
+    assert!(matches!(refused, Err(StoreError::Gone { what: "survey" })));
 }
 
 pub async fn photos_and_what_was_found_in_them(store: &dyn Store) {
@@ -35,8 +35,8 @@ pub async fn photos_and_what_was_found_in_them(store: &dyn Store) {
     .unwrap();
     let plain = [file("images/b.jpg", "1"), file("images/a.jpg", "1"), file("images/c.jpg", "2")];
     put(store, &survey, &plain).await;
-    let told = FileRecord { photo: Some(facts.clone()), ..file("images/b.jpg", "1") };
-    assert_eq!(put(store, &survey, &[told]).await, [FileWritten::Unchanged]);
+    let with_facts = FileRecord { photo: Some(facts.clone()), ..file("images/b.jpg", "1") };
+    assert_eq!(put(store, &survey, &[with_facts]).await, [FileWritten::Unchanged]);
     let shots = Some(vec!["a.jpg".to_owned(), "d.jpg".to_owned()]);
     let others = [
         FileRecord { shots: shots.clone(), ..file("reconstruction.json", "1") },
@@ -133,7 +133,7 @@ pub async fn uploads(store: &dyn Store) {
     assert!(matches!(store.create_upload(&upload, None, at(0)).await, Err(StoreError::Gone { what: "survey" })));
 }
 
-pub async fn a_file_is_replaced_only_where_it_is_as_wanted(store: &dyn Store) {
+pub async fn files_are_replaced_only_if_the_precondition_holds(store: &dyn Store) {
     let survey = survey(store, plant(store, "A").await.id, "June").await;
     let put = async |content: &str, wanted: Wanted| {
         let file = file("images/a.jpg", content);
@@ -167,7 +167,7 @@ pub async fn a_file_is_replaced_only_where_it_is_as_wanted(store: &dyn Store) {
     assert_eq!(outcomes.iter().filter(|outcome| outcome.is_some()).count(), 1, "{outcomes:?}");
 }
 
-pub async fn blobs_that_rows_name(store: &dyn Store) {
+pub async fn referenced_blobs_are_listed(store: &dyn Store) {
     let (a, b) = (plant(store, "A").await.id, plant(store, "B").await.id);
     let (june, july) = (survey(store, a, "June").await, survey(store, a, "July").await);
     let other = survey(store, b, "June").await;

@@ -21,7 +21,7 @@ async fn bytes(store: &dyn Store) -> u64 {
     store.usage(ORGANISATION, at(0)).await.unwrap().unwrap().bytes
 }
 
-pub async fn what_nothing_names_any_more_is_freed(store: &dyn Store) {
+pub async fn unreferenced_blobs_are_freed(store: &dyn Store) {
     let (a, b) = (plant(store, "A").await.id, plant(store, "B").await.id);
     let (june, july) = (survey(store, a, "June").await, survey(store, a, "July").await);
     let other = survey(store, b, "June").await;
@@ -37,7 +37,7 @@ pub async fn what_nothing_names_any_more_is_freed(store: &dyn Store) {
     assert!(take(store, 20, 100).await.is_empty(), "it is unused since 20");
     let taken = take(store, 21, 100).await;
     assert_eq!((contents(&taken), taken[0].blob.size), (vec![(a, old)], 3));
-    // Until they are gone, the bytes are nobody's, and no second one deletes them.
+    // Until they are gone, the blobs can be neither claimed nor reserved.
     assert!(take(store, 21, 101).await.is_empty());
     let again = photo("3", "old", 102);
     let refused = reserve(store, a, std::slice::from_ref(&again)).await;
@@ -60,11 +60,11 @@ pub async fn what_nothing_names_any_more_is_freed(store: &dyn Store) {
     assert_eq!(bytes(store).await, 3);
 }
 
-pub async fn bytes_that_come_again_are_kept(store: &dyn Store) {
+pub async fn blobs_that_are_uploaded_again_are_kept(store: &dyn Store) {
     let june = survey(store, plant(store, "A").await.id, "June").await;
     put(store, &june, &[photo("1", "old", 1)]).await;
     put(store, &june, &[photo("1", "new", 10)]).await;
-    // An upload has them in its hands: what it reserved is unused only from then on.
+    // An upload has reserved them: they are unused only from then on.
     let again = photo("2", "old", 50);
     reserve(store, june.plant, std::slice::from_ref(&again)).await.unwrap();
     assert!(take(store, 50, 60).await.is_empty());
@@ -80,7 +80,7 @@ pub async fn bytes_that_come_again_are_kept(store: &dyn Store) {
     assert_eq!(store.files(june.id).await.unwrap().len(), 2);
 }
 
-pub async fn a_model_that_no_row_came_to_name_is_freed(store: &dyn Store) {
+pub async fn unreferenced_models_are_freed(store: &dyn Store) {
     let june = survey(store, plant(store, "A").await.id, "June").await;
     let lost = (Digest::of(b"lost"), 4);
     let quota = Quotas { bytes: Some(1), plants: None };
@@ -97,7 +97,7 @@ pub async fn a_model_that_no_row_came_to_name_is_freed(store: &dyn Store) {
     assert!(matches!(nowhere, Err(StoreError::Gone { what: "plant" })), "{nowhere:?}");
 }
 
-pub async fn bytes_that_a_job_may_read_are_kept(store: &dyn Store) {
+pub async fn blobs_that_a_running_job_may_read_are_kept(store: &dyn Store) {
     let june = survey(store, plant(store, "A").await.id, "June").await;
     let elsewhere = survey(store, plant(store, "B").await.id, "June").await;
     for survey in [&june, &elsewhere] {
@@ -114,7 +114,7 @@ pub async fn bytes_that_a_job_may_read_are_kept(store: &dyn Store) {
     assert!(store.end_job(&running, &Ending::Released, at(101)).await.unwrap());
     let taken = take(store, 1000, 102).await;
     assert_eq!(contents(&taken), [(june.plant, Digest::of(b"old"))]);
-    // What somebody had begun to delete is deleted, whatever job began since then.
+    // A deletion that had begun is finished, even if a job began since then.
     let running = claim(store, 200).await.unwrap();
     let retaken = take(store, 1000, 300).await;
     let retaken = retaken.iter().find(|unused| unused.blob.plant == june.plant).unwrap();
@@ -127,7 +127,7 @@ pub async fn bytes_that_a_job_may_read_are_kept(store: &dyn Store) {
 }
 
 /// Files that hold the same bytes are replaced at once: whichever is last, the bytes are unused after it.
-pub async fn the_last_name_counts_whoever_is_last(store: &dyn Store) {
+pub async fn blobs_are_kept_until_the_last_reference_is_gone(store: &dyn Store) {
     let plant = plant(store, "A").await.id;
     let names: Vec<String> = (0..6).map(|number| number.to_string()).collect();
     let mut surveys = Vec::new();

@@ -3,6 +3,7 @@
 use super::{ALL, LEASE, at, claim, enqueue, model, plant, state, survey};
 use heliomap::store::{
     Cancelled, Checkpoint, Completed, Ending, Enqueued, Heartbeat, JobRequest, JobState, Page, Progress, Store,
+    StoreError,
 };
 use heliomap_model::PlantId;
 use std::time::Duration;
@@ -47,7 +48,7 @@ pub async fn jobs_of_one_plant_run_one_after_the_other(store: &dyn Store) {
     assert_eq!(claim(store, 1).await.unwrap().job.id, july.id);
 }
 
-pub async fn an_abandoned_job_is_taken_up_and_its_first_worker_is_fenced_out(store: &dyn Store) {
+pub async fn abandoned_jobs_are_claimed_again_and_their_first_worker_is_fenced(store: &dyn Store) {
     let survey = survey(store, plant(store, "A").await.id, "June").await;
     enqueue(store, &survey).await;
     let first = claim(store, 0).await.unwrap();
@@ -75,7 +76,7 @@ pub async fn a_job_that_kills_its_workers_ends(store: &dyn Store) {
     assert_eq!((job.state, job.error.unwrap().0.as_str()), (JobState::Failed, "worker_lost"));
 }
 
-pub async fn a_released_job_has_its_attempt_back(store: &dyn Store) {
+pub async fn released_jobs_get_their_attempt_back(store: &dyn Store) {
     let survey = survey(store, plant(store, "A").await.id, "June").await;
     enqueue(store, &survey).await;
     for now in 0..5 {
@@ -101,7 +102,7 @@ pub async fn retry_waits_and_ends(store: &dyn Store) {
     assert!(claim(store, 30).await.is_none());
 }
 
-pub async fn the_pause_before_a_retry_grows_while_the_job_gets_nowhere(store: &dyn Store) {
+pub async fn the_pause_before_a_retry_grows_without_progress(store: &dyn Store) {
     let survey = survey(store, plant(store, "A").await.id, "June").await;
     let options = "{}".to_owned();
     let request = JobRequest { plant: survey.plant, survey: survey.id, options, priority: 0, max_attempts: 9 };
@@ -122,7 +123,7 @@ pub async fn the_pause_before_a_retry_grows_while_the_job_gets_nowhere(store: &d
     }
 }
 
-pub async fn a_job_that_a_worker_cannot_do_waits_for_another(store: &dyn Store) {
+pub async fn declined_jobs_wait_for_another_worker(store: &dyn Store) {
     let survey = survey(store, plant(store, "A").await.id, "June").await;
     let job = enqueue(store, &survey).await;
     let declined = Ending::Declined { code: "c".to_owned(), message: "m".to_owned(), pause: Duration::from_secs(5) };
@@ -136,7 +137,7 @@ pub async fn a_job_that_a_worker_cannot_do_waits_for_another(store: &dyn Store) 
     assert_eq!((job.state, job.error), (JobState::Queued, Some(("c".to_owned(), "m".to_owned()))));
 }
 
-pub async fn what_is_cancelled_does_not_go_back_to_the_queue(store: &dyn Store) {
+pub async fn cancelled_jobs_do_not_return_to_the_queue(store: &dyn Store) {
     let survey = survey(store, plant(store, "A").await.id, "June").await;
     let (code, message) = ("c".to_owned(), "m".to_owned());
     for ending in [
@@ -237,4 +238,26 @@ pub async fn the_last_jobs_pace_is_known(store: &dyn Store) {
     let first = claim(store, 0).await.unwrap();
     store.complete_job(&first, &model(survey.plant, 1, 1), at(1)).await.unwrap();
     assert_eq!(store.last_stage_ms().await.unwrap().as_deref(), Some("{}"));
+}
+
+/// `upgrade` changes the schema as a newer version of the program would.
+pub async fn a_newer_schema_is_refused(store: &dyn Store, upgrade: impl AsyncFnOnce()) {
+    let refused = |error: Option<StoreError>| matches!(error, Some(StoreError::NewerSchema { change: 999_999 }));
+    let plant = plant(store, "Sunfield").await;
+    let [first, second] = [survey(store, plant.id, "June").await, survey(store, plant.id, "July").await];
+    let job = enqueue(store, &first).await;
+    let running = claim(store, 0).await.unwrap();
+    store.ping().await.unwrap();
+    upgrade().await;
+    assert!(refused(store.ping().await.err()));
+    assert!(refused(store.try_to_write().await.err()));
+    assert!(refused(store.heartbeat(&running, None, LEASE, at(1)).await.err()));
+    assert!(refused(store.claim_job("worker", LEASE, at(100)).await.err()));
+    let request =
+        JobRequest { plant: plant.id, survey: second.id, options: "{}".to_owned(), priority: 0, max_attempts: 2 };
+    assert!(refused(store.enqueue_job(&request, at(1)).await.err()));
+    assert!(refused(store.complete_job(&running, &model(plant.id, 1, 1), at(1)).await.err()));
+    assert!(refused(store.create_survey(plant.id, "August", at(1)).await.err()));
+    assert_eq!(state(store, &job).await, JobState::Running);
+    assert!(store.models(plant.id, ALL).await.unwrap().is_empty());
 }

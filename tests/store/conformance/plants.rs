@@ -29,8 +29,8 @@ pub async fn plants_and_surveys(store: &dyn Store) {
     assert_eq!(survey(store, a.id, "June").await.id, june.id);
     assert!(store.survey(b.id, july.id).await.unwrap().is_none());
     assert_eq!(store.surveys(a.id, "", ALL).await.unwrap().len(), 2);
-    let nobody = store.create_survey(PlantId(Uuid::nil()), "June", at(0)).await;
-    assert!(matches!(nobody, Err(StoreError::Gone { what: "plant" })));
+    let refused = store.create_survey(PlantId(Uuid::nil()), "June", at(0)).await;
+    assert!(matches!(refused, Err(StoreError::Gone { what: "plant" })));
 }
 
 pub async fn a_deleted_plant_takes_everything_with_it(store: &dyn Store) {

@@ -15,7 +15,7 @@ pub async fn quotas(store: &dyn Store) {
     assert_eq!(usage().await, kept);
     assert!(store.usage(OrganisationId(Uuid::max()), at(5)).await.unwrap().is_none());
 
-    // The same bytes count once in a plant, whoever says so again.
+    // The same bytes count once in a plant.
     let (one, two) = ((Digest::of(b"1"), 60), (Digest::of(b"2"), 50));
     let none = Quotas::default();
     store.reserve_bytes(a.id, &[one, one], none, at(1)).await.unwrap();
@@ -29,7 +29,7 @@ pub async fn quotas(store: &dyn Store) {
     let nowhere = store.reserve_bytes(PlantId(Uuid::nil()), &[one], none, at(1)).await;
     assert!(matches!(nowhere, Err(StoreError::Gone { what: "plant" })));
 
-    // What is said of one organisation goes before what holds for all.
+    // Quotas of one organisation override the defaults.
     let refused = store.create_plant(ORGANISATION, "B", tight, at(1)).await;
     assert!(matches!(refused, Err(StoreError::OverQuota { what: "plants", used: 1, quota: 1 })), "{refused:?}");
     assert!(matches!(store.create_plant(ORGANISATION, "A", tight, at(1)).await.unwrap(), Created::Existing(_)));
@@ -74,7 +74,7 @@ pub async fn quotas(store: &dyn Store) {
     begin(113, bounds(2, true)).await.unwrap();
     assert!(matches!(begin(114, bounds(2, true)).await, Err(StoreError::OverQuota { .. })));
     let refused = begin(1, bounds(1, true)).await;
-    assert!(matches!(refused, Err(StoreError::TooManyUploads { open: 1, most: 1 })), "{refused:?}");
+    assert!(matches!(refused, Err(StoreError::TooManyUploads { open: 1, max: 1 })), "{refused:?}");
     store.set_quotas(ORGANISATION, own).await.unwrap();
 
     // A model counts, and what is deleted does not.

@@ -10,7 +10,7 @@ fn tasks(images: &[&str]) -> Vec<ImageTask> {
     images.iter().map(task).collect()
 }
 
-pub async fn images_of_a_job_are_shared(store: &dyn Store) {
+pub async fn tasks_are_shared_among_workers(store: &dyn Store) {
     let survey = survey(store, plant(store, "A").await.id, "June").await;
     enqueue(store, &survey).await;
     let owner = claim(store, 0).await.unwrap();
@@ -41,7 +41,7 @@ pub async fn images_of_a_job_are_shared(store: &dyn Store) {
     assert!(store.take_task("this version", LEASE, at(1)).await.unwrap().is_none());
     assert_eq!(store.waiting_tasks(at(1)).await.unwrap(), 0);
     assert_eq!(store.take_own_task(&owner, at(1)).await.unwrap(), OwnTask::Image("c".to_owned()));
-    assert_eq!(store.take_own_task(&owner, at(1)).await.unwrap(), OwnTask::InOtherHands);
+    assert_eq!(store.take_own_task(&owner, at(1)).await.unwrap(), OwnTask::HeldByOthers);
     store.give_back_task(&last, GivenBack::ToAll).await.unwrap();
     assert_eq!(store.take_own_task(&owner, at(1)).await.unwrap(), OwnTask::Image("d".to_owned()));
     assert_eq!(store.take_own_task(&owner, at(1)).await.unwrap(), OwnTask::None);
@@ -50,7 +50,7 @@ pub async fn images_of_a_job_are_shared(store: &dyn Store) {
     assert_eq!(store.checkpoints(owner.job.id, "f").await.unwrap().len(), 4);
 }
 
-pub async fn work_is_told(store: &dyn Store) {
+pub async fn workers_are_notified(store: &dyn Store) {
     let plant = plant(store, "A").await.id;
     let (june, july) = (survey(store, plant, "June").await, survey(store, plant, "July").await);
     let bell = Notify::new();
@@ -82,7 +82,7 @@ pub async fn work_is_told(store: &dyn Store) {
     };
     tokio::time::timeout(Duration::from_secs(60), async {
         tokio::select! {
-            () = store.ring_for_work(&bell) => unreachable!("it rings for as long as it is polled"),
+            () = store.listen_for_work(&bell) => unreachable!("it rings for as long as it is polled"),
             () = script => {}
         }
     })
@@ -90,7 +90,7 @@ pub async fn work_is_told(store: &dyn Store) {
     .expect("it rings");
 }
 
-pub async fn images_in_silent_hands_come_back(store: &dyn Store) {
+pub async fn tasks_of_silent_workers_are_claimed_again(store: &dyn Store) {
     let survey = survey(store, plant(store, "A").await.id, "June").await;
     enqueue(store, &survey).await;
     assert!(claim(store, 0).await.is_some());
@@ -99,7 +99,7 @@ pub async fn images_in_silent_hands_come_back(store: &dyn Store) {
     let silent = store.take_task("v", LEASE, at(100)).await.unwrap().unwrap();
     let alive = store.take_task("v", LEASE, at(100)).await.unwrap().unwrap();
     assert_eq!(store.extend_tasks(&[alive.token], LEASE, at(120)).await.unwrap(), [alive.token]);
-    assert_eq!(store.take_own_task(&owner, at(130)).await.unwrap(), OwnTask::InOtherHands);
+    assert_eq!(store.take_own_task(&owner, at(130)).await.unwrap(), OwnTask::HeldByOthers);
     assert!(store.take_task("v", LEASE, at(130)).await.unwrap().is_none());
     let second = store.take_task("v", LEASE, at(131)).await.unwrap().unwrap();
     assert_eq!((second.task.image.as_str(), second.token != silent.token), ("a", true));
@@ -114,7 +114,7 @@ pub async fn images_in_silent_hands_come_back(store: &dyn Store) {
     assert_eq!(claim(store, 200).await.unwrap().job.attempt, 3);
 }
 
-pub async fn images_go_with_their_job(store: &dyn Store) {
+pub async fn tasks_are_deleted_with_their_job(store: &dyn Store) {
     let survey = survey(store, plant(store, "A").await.id, "June").await;
     let job = enqueue(store, &survey).await;
     let first = claim(store, 0).await.unwrap();
@@ -123,7 +123,7 @@ pub async fn images_go_with_their_job(store: &dyn Store) {
     // The next worker offers anew; what was held before is lost.
     let second = claim(store, 40).await.unwrap();
     assert!(!store.offer_tasks(&first, "f", "v", &tasks(&["a"])).await.unwrap());
-    assert_eq!(store.take_own_task(&first, at(40)).await.unwrap(), OwnTask::InOtherHands);
+    assert_eq!(store.take_own_task(&first, at(40)).await.unwrap(), OwnTask::HeldByOthers);
     assert!(store.offer_tasks(&second, "g", "v", &tasks(&["a", "b"])).await.unwrap());
     assert!(!store.finish_task(&held, b"late").await.unwrap());
     assert!(store.checkpoints(job.id, "g").await.unwrap().is_empty());

@@ -42,7 +42,7 @@ pub async fn webhooks(store: &dyn Store) {
     assert!(store.webhook(other.id, all.id).await.unwrap().is_none());
     assert!(!store.delete_webhook(other.id, all.id).await.unwrap());
 
-    // Every end is told once, whatever it is; what goes back to the queue is none.
+    // Every end creates one message; a return to the queue creates none.
     let (june, july) = (survey(store, a.id, "June").await, survey(store, b.id, "July").await);
     let mut ended = Vec::new();
     for ending in 0..5 {
@@ -93,7 +93,7 @@ pub async fn webhooks(store: &dyn Store) {
     assert!(store.create_webhook(&more, at(0)).await.unwrap().is_none());
 }
 
-pub async fn messages_are_sent_by_one_at_a_time_and_not_for_ever(store: &dyn Store) {
+pub async fn messages_are_claimed_once_and_have_limited_attempts(store: &dyn Store) {
     let survey = survey(store, plant(store, "A").await.id, "June").await;
     let webhook = webhook(store, ORGANISATION, None).await;
     let job = enqueue(store, &survey).await;
@@ -136,8 +136,8 @@ pub async fn messages_are_sent_by_one_at_a_time_and_not_for_ever(store: &dyn Sto
     assert_eq!((dead.len(), dead[0].attempts, dead[0].error.as_deref()), (1, 17, Some("refused")));
     assert!(store.deliveries(webhook.id, Some(DeliveryState::Waiting), ALL).await.unwrap().is_empty());
 
-    let nobody = WebhookId(Uuid::nil());
-    assert!(store.resend_delivery(nobody, dead[0].id, at(1000)).await.unwrap().is_none());
+    let refused = WebhookId(Uuid::nil());
+    assert!(store.resend_delivery(refused, dead[0].id, at(1000)).await.unwrap().is_none());
     let waiting = store.resend_delivery(webhook.id, dead[0].id, at(1000)).await.unwrap().unwrap();
     assert_eq!((waiting.state, waiting.finished), (DeliveryState::Waiting, None));
     let again = take(1000).await.unwrap();
@@ -152,7 +152,7 @@ pub async fn messages_are_sent_by_one_at_a_time_and_not_for_ever(store: &dyn Sto
     assert!(messages(store, &webhook).await.is_empty());
 }
 
-pub async fn messages_of_a_busy_organisation_keep_no_other_waiting(store: &dyn Store) {
+pub async fn busy_organisations_do_not_delay_messages_of_others(store: &dyn Store) {
     let (Created::New(other) | Created::Existing(other)) = store.create_organisation("other", at(0)).await.unwrap();
     let other = other.id;
     let (Created::New(theirs) | Created::Existing(theirs)) =

@@ -1,4 +1,4 @@
-//! A running job's images, shared with other workers: the side of the worker whose job it is.
+//! Publishes the images of a running job as tasks that other workers may run, and collects their results.
 
 use crate::store::{Claim, Digest, FileRecord, ImageTask, OwnTask, Store, StoreError};
 use heliomap_mapping::pipeline::{Found, ImageRequest, NextImage};
@@ -11,20 +11,20 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::runtime::Handle;
 
-/// How often it is looked whether others have found something.
+/// How often results of other workers are collected.
 const GATHER_EVERY: Duration = Duration::from_millis(100);
 
-/// What a worker needs to know of an image to search it.
+/// What a worker needs to know of an image to run the detector on it.
 #[derive(Debug, Serialize, Deserialize)]
-pub(super) struct Errand {
+pub(super) struct TaskDocument {
     /// The image; its path is relative to the survey's folder.
-    pub sought: ImageRequest,
-    /// The bytes of its photo, SHA-256, hexadecimal.
+    pub request: ImageRequest,
+    /// Digest of its photo, hexadecimal.
     pub sha256: String,
 }
 
-/// The images of a claimed job, offered to all workers. Its methods block: they are called from the mapping's threads.
-pub(super) struct Share {
+/// Publishes the images of one claimed job. Its methods block: they are called from the mapping's threads.
+pub(super) struct TaskPublisher {
     pub store: Arc<dyn Store>,
     pub claim: Claim,
     pub fingerprint: String,
@@ -37,21 +37,21 @@ pub(super) struct Share {
     pub state: Mutex<State>,
 }
 
-/// What was offered, and what came back.
+/// Tasks that were published, and results that came back.
 #[derive(Debug, Default)]
 pub(super) struct State {
-    /// The places of the images that were offered, by name; none while all are to be searched here.
+    /// Positions of the published images, by name; empty while all images are processed here.
     places: HashMap<String, usize>,
     found: VecDeque<(usize, Box<Found>)>,
     gathered: Option<Instant>,
 }
 
-impl Share {
+impl TaskPublisher {
     pub fn digests(files: &[FileRecord]) -> HashMap<PathBuf, Digest> {
         files.iter().map(|file| (PathBuf::from(file.path.as_str()), file.sha256)).collect()
     }
 
-    /// Offers images; `false` where the job is in other hands. What cannot be offered is searched here.
+    /// Publishes images; `false` where the lease of the job was lost. Images that cannot be published are processed here.
     pub fn offer(&self, images: &[ImageRequest]) -> bool {
         let tasks: Option<Vec<ImageTask>> = images.iter().map(|image| self.task(image)).collect();
         let Some(tasks) = tasks else { return true };
@@ -64,7 +64,7 @@ impl Share {
             }
             Ok(false) => false,
             Err(error) => {
-                tracing::warn!(%error, "the job's images cannot be offered to other workers");
+                tracing::warn!(%error, "cannot publish the job's images to other workers");
                 true
             }
         }
@@ -73,11 +73,11 @@ impl Share {
     fn task(&self, image: &ImageRequest) -> Option<ImageTask> {
         let path = image.path.strip_prefix(&self.folder).ok()?.to_owned();
         let sha256 = self.digests.get(&path)?.to_string();
-        let errand = Errand { sought: ImageRequest { path, ..image.clone() }, sha256 };
-        Some(ImageTask { image: image.image.clone(), document: serde_json::to_string(&errand).ok()? })
+        let document = TaskDocument { request: ImageRequest { path, ..image.clone() }, sha256 };
+        Some(ImageTask { image: image.image.clone(), document: serde_json::to_string(&document).ok()? })
     }
 
-    /// What is next, of the images `left`.
+    /// What to do next, of the images `left`.
     pub fn next(&self, left: &[usize]) -> NextImage {
         let mut state = self.state();
         if state.places.is_empty() {
@@ -94,8 +94,8 @@ impl Share {
                 Some(place) if left.contains(place) => NextImage::Search(*place),
                 _ => NextImage::Wait,
             },
-            Ok(OwnTask::InOtherHands) => NextImage::Wait,
-            // What others did and cannot be read, or what nobody has: it is searched here.
+            Ok(OwnTask::HeldByOthers) => NextImage::Wait,
+            // Results that cannot be read, or tasks that are gone: the image is processed here.
             Ok(OwnTask::None) => {
                 self.gather(&mut state);
                 match state.found.pop_front() {
@@ -104,19 +104,19 @@ impl Share {
                 }
             }
             Err(error) => {
-                // The heartbeat tells when this has lasted too long.
-                tracing::warn!(%error, "cannot look which image is next");
+                // The heartbeat ends the job where this lasts too long.
+                tracing::warn!(%error, "cannot take the next image");
                 NextImage::Wait
             }
         }
     }
 
-    /// Looks what others have found.
+    /// Collects results of other workers.
     fn gather(&self, state: &mut State) {
         state.gathered = Some(Instant::now());
         let found = match self.runtime.block_on(self.store.gather_tasks(&self.claim)) {
             Ok(found) => found,
-            Err(error) => return tracing::warn!(%error, "cannot look what other workers have found"),
+            Err(error) => return tracing::warn!(%error, "cannot collect results of other workers"),
         };
         for checkpoint in found {
             let document: Result<Found, _> = ciborium::from_reader(checkpoint.document.as_slice());
@@ -131,14 +131,14 @@ impl Share {
     }
 }
 
-/// Where a photo of another worker's job is, read from a task.
+/// Reads the document of a task; the digest of its photo comes apart.
 ///
 /// # Errors
-/// A task that this program does not write.
-pub(super) fn errand(document: &str, plant: PlantId) -> Result<(Errand, Digest), StoreError> {
+/// A document that this program does not write.
+pub(super) fn read_task(document: &str, plant: PlantId) -> Result<(TaskDocument, Digest), StoreError> {
     let corrupt = || StoreError::Corrupt { what: "task", value: format!("a document of a job of plant {plant}") };
-    let errand: Errand = serde_json::from_str(document).map_err(|_| corrupt())?;
-    let sha256 = errand.sha256.parse().map_err(|()| corrupt())?;
+    let task: TaskDocument = serde_json::from_str(document).map_err(|_| corrupt())?;
+    let sha256 = task.sha256.parse().map_err(|()| corrupt())?;
     let inside = |path: &Path| path.components().all(|part| matches!(part, std::path::Component::Normal(_)));
-    if inside(&errand.sought.path) { Ok((errand, sha256)) } else { Err(corrupt()) }
+    if inside(&task.request.path) { Ok((task, sha256)) } else { Err(corrupt()) }
 }
