@@ -7,6 +7,7 @@ mod boxes;
 mod configuration;
 mod doctor;
 mod traces;
+mod upgrade;
 mod uploads;
 
 use heliomap::store::{Digest, SqliteStore, SurveyId, Upload, UploadId, UploadStore};

@@ -12,7 +12,7 @@ pub struct Health {
     #[schema(example = "ok")]
     pub status: &'static str,
     /// The version of the program.
-    #[schema(example = "0.1.0")]
+    #[schema(example = "0.2.0")]
     pub version: &'static str,
     /// What whoever runs the service should see to; left out where there is nothing.
     #[serde(skip_serializing_if = "Vec::is_empty")]
