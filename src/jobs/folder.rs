@@ -32,8 +32,8 @@ pub(super) struct JobFolder {
     plant: PlantId,
     /// The photos, by their places in the folder.
     photos: HashMap<PathBuf, Kept>,
-    /// The names of the files in `images/`, sorted.
-    images: Vec<String>,
+    /// The places of the photos, sorted.
+    images: Vec<PathBuf>,
     runtime: Handle,
 }
 
@@ -62,7 +62,7 @@ impl JobFolder {
         });
         placed.buffer_unordered(FILES_AT_ONCE).try_collect::<()>().await?;
         let images = files.iter().filter(|file| file.path.kind() == FileKind::Image);
-        let mut images: Vec<String> = images.map(|file| file.path.file_name().to_owned()).collect();
+        let mut images: Vec<PathBuf> = images.map(|file| PathBuf::from(file.path.as_str())).collect();
         images.sort();
         Ok(Self { folder, blobs: blobs.clone(), plant, photos, images, runtime: Handle::current() })
     }
@@ -90,7 +90,7 @@ impl ProjectFolder for JobFolder {
         }
     }
 
-    fn images(&self) -> Vec<String> {
+    fn images(&self) -> Vec<PathBuf> {
         self.images.clone()
     }
 

@@ -69,8 +69,8 @@ impl Mapper for ScriptedMapper {
     ) -> Result<PlantModel, MapError> {
         let mut files = Vec::new();
         list(folder.path(), folder.path(), &mut files);
-        for name in folder.images() {
-            let place = Path::new("images").join(&name);
+        for place in folder.images() {
+            let name = place.file_name().unwrap().to_str().unwrap().to_owned();
             let header = folder.inspect(&place, u64::MAX).unwrap().unwrap();
             let camera = Camera::pinhole(header.width_px, header.height_px, 0.8);
             let photo = Photo { shot: name, path: folder.path().join(&place), header, camera };

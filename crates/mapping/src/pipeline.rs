@@ -85,6 +85,14 @@ pub fn map_folder(
         clock.stage(Stage::Read, || reconstruction::opensfm::read(folder, options.max_image_pixels))??;
     let mut warnings: Vec<Warning> =
         project.notes.iter().map(|note| Warning::new(note.code, note.message.clone(), [])).collect();
+    if !project.reconstruction.georeferenced && options.control.is_none() {
+        return Err(MapError::Input {
+            code: "no_gnss",
+            message: "no photo has a GNSS position, so place, heading and scale of the plant are unknown: give photos as the \
+                      camera wrote them (with EXIF), or control points"
+                .to_owned(),
+        });
+    }
     let cloud = cloud_of(&mut project);
     let gsd_m = images::ground_sampling_distances(&project.reconstruction.shots, &cloud);
 

@@ -133,7 +133,7 @@ pub(super) fn reconstruct(
     let nearest = Nearest::new(truth, shots, ground_z_m);
     let sparse = world.sparse(&nearest, seed);
     let dense = (errors.cloud_points_per_m2 > 0.0).then(|| world.cloud(&nearest, seed));
-    Reconstruction { reference: truth.reference, sparse_points_m: sparse, dense, shots: estimated }
+    Reconstruction { reference: truth.reference, georeferenced: true, sparse_points_m: sparse, dense, shots: estimated }
 }
 
 /// Which view looks most directly at a place, by square tiles.

@@ -26,6 +26,18 @@ pub enum ReconstructionError {
     UnknownCameraModel { path: PathBuf, camera: String, model: String },
     #[error("{} holds {found} shots: a plant cannot be mapped from fewer than two images", path.display())]
     TooFewShots { path: PathBuf, found: usize },
+    #[error(
+        "{} is not in a local frame: its cameras stand about ({east_m:.0}, {north_m:.0}) m, which is in no UTM zone at \
+         reference_lla.json; give reconstruction.topocentric.json, which ODM leaves beside it",
+        path.display()
+    )]
+    NotLocal { path: PathBuf, east_m: f64, north_m: f64 },
+    #[error(
+        "{} lies elsewhere than the sparse points and cameras of the reconstruction: it was made by another program, or is of \
+         another frame or plant; give the cloud that OpenSfM made, or remove the file to map from the sparse points",
+        path.display()
+    )]
+    CloudElsewhere { path: PathBuf },
     #[error("{} holds no points: densify again, or remove the file to map from the sparse points", path.display())]
     EmptyCloud { path: PathBuf },
     #[error("{} promises {promised} points but ends after {held}: it was cut short; copy it again", path.display())]
@@ -47,6 +59,8 @@ impl ReconstructionError {
             Self::NotFinite { .. } => "reconstruction_not_finite",
             Self::UnknownCameraModel { .. } => "camera_model_unknown",
             Self::TooFewShots { .. } => "too_few_images",
+            Self::NotLocal { .. } => "reconstruction_not_local",
+            Self::CloudElsewhere { .. } => "point_cloud_elsewhere",
             Self::EmptyCloud { .. } => "point_cloud_empty",
             Self::TruncatedCloud { .. } => "point_cloud_truncated",
             Self::CloudTooLarge { .. } => "point_cloud_too_large",

@@ -16,14 +16,33 @@ pub trait ProjectFolder: Sync {
     /// What is wrong with the photo, more than `max_pixels` among it.
     fn inspect(&self, place: &Path, max_pixels: u64) -> Result<Option<PhotoHeader>, PhotoError>;
 
-    /// The names of the files in `images/`, sorted.
-    fn images(&self) -> Vec<String>;
+    /// The files in `images/` and `opensfm/images/` and the folders below them, relative to the folder, sorted.
+    fn images(&self) -> Vec<PathBuf>;
 
     /// As [`Photo::load`], of a photo of this folder.
     ///
     /// # Errors
     /// Data that does not decode; a photo that cannot be brought here.
     fn load(&self, photo: &Photo) -> Result<RgbImage, ReadError>;
+}
+
+/// How deep folders in `images/` are looked through: cameras split flights into `100MEDIA/`, people sort them by day.
+const MAX_FOLDER_DEPTH: usize = 4;
+
+/// Adds the files in `place` and, down to `depth`, below it; hidden ones and what archives leave for macOS apart.
+fn collect_files(root: &Path, place: &Path, depth: usize, places: &mut Vec<PathBuf>) {
+    for entry in std::fs::read_dir(root.join(place)).into_iter().flatten().flatten() {
+        let name = entry.file_name();
+        if name.to_string_lossy().starts_with(['.', '_']) {
+            continue;
+        }
+        let inner = place.join(&name);
+        match entry.file_type() {
+            Ok(kind) if kind.is_dir() && depth > 0 => collect_files(root, &inner, depth - 1, places),
+            Ok(kind) if !kind.is_dir() => places.push(inner),
+            _ => {}
+        }
+    }
 }
 
 /// A folder in which everything lies.
@@ -40,11 +59,13 @@ impl ProjectFolder for PathBuf {
         photo::inspect(&path, &photo::file_name(place), max_pixels).map(Some)
     }
 
-    fn images(&self) -> Vec<String> {
-        let entries = std::fs::read_dir(self.join("images")).into_iter().flatten().flatten();
-        let mut names: Vec<String> = entries.map(|entry| entry.file_name().to_string_lossy().into_owned()).collect();
-        names.sort();
-        names
+    fn images(&self) -> Vec<PathBuf> {
+        let mut places = Vec::new();
+        for images in ["images", "opensfm/images"] {
+            collect_files(self, Path::new(images), MAX_FOLDER_DEPTH, &mut places);
+        }
+        places.sort();
+        places
     }
 
     fn load(&self, photo: &Photo) -> Result<RgbImage, ReadError> {

@@ -6,6 +6,7 @@ mod folder;
 mod jpeg;
 pub mod opensfm;
 pub mod photo;
+mod plausible;
 pub mod ply;
 pub mod quality;
 
@@ -32,6 +33,8 @@ pub struct Shot {
 #[derive(Debug, Clone)]
 pub struct Reconstruction {
     pub reference: GeodeticReference,
+    /// Whether place and scale come from GNSS or control; otherwise both are arbitrary.
+    pub georeferenced: bool,
     /// Sorted by name.
     pub shots: Vec<Shot>,
     /// Sparse points (tie points), metres.

@@ -1,71 +1,74 @@
-//! Reads what OpenSfM leaves in its project folder.
+//! Reads what OpenSfM leaves in its project folder, and the project folder of ODM, which holds that of OpenSfM.
+
+mod cameras;
+mod frame;
+mod json;
+mod photos;
 
 use super::error::ReconstructionError;
-use super::photo::{Photo, PhotoError, PhotoHeader, file_name};
-use super::{Project, ProjectFolder, Reconstruction, Shot, ply};
-use crate::geometry::camera::Lens;
+use super::photo::{Photo, PhotoError, file_name};
+use super::{Note, Project, ProjectFolder, ReadError, Reconstruction, Shot, plausible, ply};
 use crate::geometry::{Camera, Pose};
+use cameras::{camera, is_known};
+use frame::Frame;
 use heliomap_model::{GeodeticReference, Lla};
+use json::{CameraEntry, Component, ReferenceEntry, ShotEntry, read_components, read_small};
 use nalgebra::Vector3;
-use serde::Deserialize;
-use serde::de::DeserializeOwned;
+use photos::{PhotoFinder, Undistorted};
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs::File;
-use std::io::Read;
 use std::path::{Path, PathBuf};
 
-const MAX_JSON_BYTES: u64 = 4 << 30;
-const MAX_REFERENCE_BYTES: u64 = 1 << 20;
+/// Fewest sparse points by which modules can be placed without a dense cloud.
+const MIN_SPARSE_POINTS: usize = 16;
+/// A dilution of precision from here on says that there was no GNSS fix (OpenSfM writes 999999).
+const NO_FIX_DOP: f64 = 999.0;
 
-#[derive(Deserialize)]
-struct Component {
-    cameras: BTreeMap<String, CameraEntry>,
-    shots: BTreeMap<String, ShotEntry>,
-    #[serde(default)]
-    points: BTreeMap<String, PointEntry>,
-    #[serde(default)]
-    reference_lla: Option<ReferenceEntry>,
+/// Where the files of a project lie.
+struct ProjectFiles {
+    /// Of the cameras, shots and points.
+    reconstruction: PathBuf,
+    reference: PathBuf,
+    undistorted: PathBuf,
+    /// The undistorted images, relative to the project folder.
+    undistorted_images: PathBuf,
+    /// ODM's offset and projection, where `reconstruction` is in them.
+    georeferencing: Option<PathBuf>,
 }
 
-#[derive(Deserialize)]
-struct CameraEntry {
-    projection_type: String,
-    width: u32,
-    height: u32,
-    focal: Option<f64>,
-    focal_x: Option<f64>,
-    focal_y: Option<f64>,
-    c_x: Option<f64>,
-    c_y: Option<f64>,
-    k1: Option<f64>,
-    k2: Option<f64>,
-    k3: Option<f64>,
-    k4: Option<f64>,
-    p1: Option<f64>,
-    p2: Option<f64>,
-}
+impl ProjectFiles {
+    /// The files of OpenSfM in `folder`, or in its `opensfm/` where ODM made it.
+    fn find(folder: &Path) -> Result<Self, ReconstructionError> {
+        let missing = folder.join("reconstruction.json");
+        for base in ["", "opensfm"] {
+            let inner = folder.join(base);
+            let undistorted = inner.join("undistorted");
+            let files = |reconstruction: PathBuf, georeferencing: Option<PathBuf>| Self {
+                reconstruction,
+                reference: inner.join("reference_lla.json"),
+                undistorted: undistorted.join("reconstruction.json"),
+                undistorted_images: Path::new(base).join("undistorted").join("images"),
+                georeferencing,
+            };
+            // ODM keeps the local frame aside when it rewrites reconstruction.json to UTM.
+            let local = inner.join("reconstruction.topocentric.json");
+            if local.is_file() {
+                return Ok(files(local, None));
+            }
+            let plain = inner.join("reconstruction.json");
+            if plain.is_file() {
+                let georeferencing = folder.join("odm_georeferencing");
+                return Ok(files(plain, georeferencing.is_dir().then_some(georeferencing)));
+            }
+            if undistorted.join("reconstruction.json").is_file() {
+                return Ok(files(undistorted.join("reconstruction.json"), None));
+            }
+        }
+        Err(ReconstructionError::Missing { path: missing })
+    }
 
-#[derive(Deserialize)]
-struct ShotEntry {
-    rotation: [f64; 3],
-    translation: [f64; 3],
-    camera: String,
-    #[serde(default)]
-    gps_position: Option<[f64; 3]>,
-    #[serde(default)]
-    gps_dop: Option<f64>,
-}
-
-#[derive(Deserialize)]
-struct PointEntry {
-    coordinates: [f64; 3],
-}
-
-#[derive(Deserialize, Clone, Copy)]
-struct ReferenceEntry {
-    latitude: f64,
-    longitude: f64,
-    altitude: f64,
+    fn cloud(&self) -> PathBuf {
+        self.undistorted.with_file_name("depthmaps").join("merged.ply")
+    }
 }
 
 /// Reads the project in `folder`: poses, cameras, reference, points, and which photo belongs to which shot. Photos are
@@ -73,171 +76,188 @@ struct ReferenceEntry {
 ///
 /// # Errors
 /// What is missing, broken or does not fit together, by file and with what to do.
-pub fn read(project: &dyn ProjectFolder, max_pixels: u64) -> Result<Project, super::ReadError> {
-    let folder = project.path();
-    let original = folder.join("reconstruction.json");
-    let undistorted = folder.join("undistorted").join("reconstruction.json");
-    if !original.is_file() && !undistorted.is_file() {
-        return Err(ReconstructionError::Missing { path: original }.into());
-    }
-    let source = if original.is_file() { &original } else { &undistorted };
-    let components: Vec<Component> = read_json(source, MAX_JSON_BYTES)?;
-    let undistorted_components: Option<Vec<Component>> =
-        if original.is_file() && undistorted.is_file() { Some(read_json(&undistorted, MAX_JSON_BYTES)?) } else { None };
-    let mut notes = Vec::new();
-    let reference = read_reference(folder, source, &components)?;
+pub fn read(project: &dyn ProjectFolder, max_pixels: u64) -> Result<Project, ReadError> {
+    let files = ProjectFiles::find(project.path())?;
+    let source = &files.reconstruction;
+    let components = read_components(source)?;
     let shot_count: usize = components.iter().map(|component| component.shots.len()).sum();
     if shot_count < 2 {
         return Err(ReconstructionError::TooFewShots { path: source.clone(), found: shot_count }.into());
     }
-    if components.len() > 1 {
-        let sizes: Vec<String> = components.iter().map(|component| component.shots.len().to_string()).collect();
-        notes.push(crate::reconstruction::Note {
-            code: "several_components",
-            message: format!(
-                "reconstruction.json holds {} components of {} shots, tied to each other by GNSS alone: benches seen from \
-                 two of them may not fit together; fly with more overlap and reconstruct again",
-                components.len(),
-                sizes.join(" and ")
-            ),
-        });
-    }
-
-    let cameras_of_file =
-        |components: &[Component], path: &Path| -> Result<BTreeMap<String, Camera>, ReconstructionError> {
-            let mut cameras = BTreeMap::new();
-            for component in components {
-                for (name, entry) in &component.cameras {
-                    cameras.insert(name.clone(), camera(path, name, entry)?);
-                }
-            }
-            Ok(cameras)
-        };
-    let cameras = cameras_of_file(&components, source)?;
-    // The camera of a shot's undistorted image, where the undistorted set says it.
-    let mut undistorted_camera_of: BTreeMap<&str, Camera> = BTreeMap::new();
-    if let Some(set) = &undistorted_components {
-        let set_cameras = cameras_of_file(set, &undistorted)?;
-        for (name, shot) in set.iter().flat_map(|component| &component.shots) {
-            if let Some(camera) = set_cameras.get(&shot.camera) {
-                undistorted_camera_of.insert(name, *camera);
-            }
-        }
-    }
-
-    let mut shots = Vec::with_capacity(shot_count);
-    let mut photos = Vec::with_capacity(shot_count);
-    let mut missing: Vec<&str> = Vec::new();
-    let mut seen = BTreeSet::new();
-    let mut sparse_points_m = Vec::new();
-    for component in &components {
-        for (name, entry) in &component.shots {
-            if !seen.insert(name.as_str()) {
-                continue;
-            }
-            let finite = entry.rotation.iter().chain(&entry.translation).all(|value| value.is_finite());
-            if !finite {
-                return Err(ReconstructionError::NotFinite {
-                    path: source.clone(),
-                    value: "a number that is not finite".to_owned(),
-                    place: format!("pose of shot {name}"),
-                }
-                .into());
-            }
-            let own = *cameras.get(&entry.camera).ok_or_else(|| ReconstructionError::Malformed {
-                path: source.clone(),
-                what: format!("shot {name} names camera `{}`, which is not there", entry.camera),
-            })?;
-            let flat = undistorted_camera_of.get(name.as_str()).copied().unwrap_or_else(|| own.undistorted());
-            let Some((place, stored, header)) = find_photo(project, name, own, flat, max_pixels)? else {
-                missing.push(name);
-                continue;
-            };
-            let camera = fitted(&stored, name, header, &mut notes);
-            let photo = Photo { shot: name.clone(), path: folder.join(place), header, camera };
-            shots.push(Shot {
-                name: name.clone(),
-                camera: photo.undistorted_camera(),
-                pose: Pose::from_axis_angle(entry.rotation.into(), entry.translation.into()),
-                gnss_enu_m: entry
-                    .gps_position
-                    .filter(|position| position.iter().all(|value| value.is_finite()))
-                    .filter(|_| entry.gps_dop.is_none_or(|dop| dop < 999.0))
-                    .map(Vector3::from),
-            });
-            photos.push(photo);
-        }
-        sparse_points_m.extend(
-            component
-                .points
-                .values()
-                .map(|point| Vector3::from(point.coordinates))
-                .filter(|point| point.iter().all(|value| value.is_finite())),
-        );
-    }
-    if !missing.is_empty() {
-        return Err(missing_photos(project, source, &missing, shot_count));
-    }
-    shots.sort_by(|a, b| a.name.cmp(&b.name));
-    photos.sort_by(|a, b| a.shot.cmp(&b.shot));
-
-    let cloud_path = folder.join("undistorted").join("depthmaps").join("merged.ply");
+    let mut notes = Vec::new();
+    notes.extend(several_components(&components));
+    let reference = read_reference(&files.reference, source, &components)?;
+    let frame = Frame::of(source, &components, reference, files.georeferencing.as_deref())?;
+    let finder = PhotoFinder::new(project, undistorted(&files)?, max_pixels);
+    let (shots, photos) = read_shots(project, source, &components, &frame, &finder, &mut notes)?;
+    let sparse_points_m: Vec<Vector3<f64>> = components
+        .iter()
+        .flat_map(|component| component.points.values())
+        .filter_map(|point| frame.point(point.coordinates.into()))
+        .filter(|point| point.iter().all(|value| value.is_finite()))
+        .collect();
+    let cloud_path = files.cloud();
     let dense = if cloud_path.is_file() { Some(ply::read(&cloud_path)?) } else { None };
     if dense.is_none() {
-        if sparse_points_m.len() < 16 {
+        if sparse_points_m.len() < MIN_SPARSE_POINTS {
             return Err(ReconstructionError::NoPoints { cloud: cloud_path, reconstruction: source.clone() }.into());
         }
-        notes.push(crate::reconstruction::Note {
+        notes.push(Note {
             code: "no_dense_cloud",
             message: "undistorted/depthmaps/merged.ply is not there: modules are located by the sparse points and by \
                       triangulation alone"
                 .to_owned(),
         });
     }
-    let reconstruction = Reconstruction { reference, shots, sparse_points_m, dense };
-    notes.extend(implausible_gnss(&reconstruction));
+    let georeferenced = is_georeferenced(reference, &shots);
+    let reconstruction = Reconstruction { reference, georeferenced, shots, sparse_points_m, dense };
+    plausible::check_cloud(&cloud_path, &reconstruction)?;
+    notes.extend(plausible::far_from_gnss(&reconstruction));
     Ok(Project { reconstruction, photos, notes })
 }
 
-/// Reads a JSON file whole, its size bounded.
-fn read_json<T: DeserializeOwned>(path: &Path, limit: u64) -> Result<T, ReconstructionError> {
-    let unreadable = |source| ReconstructionError::Unreadable { path: path.to_owned(), source };
-    let file = File::open(path).map_err(unreadable)?;
-    let bytes = file.metadata().map_err(unreadable)?.len();
-    if bytes > limit {
-        return Err(ReconstructionError::TooLarge { path: path.to_owned(), bytes, limit });
-    }
-    let mut text = Vec::with_capacity(bytes as usize);
-    file.take(limit).read_to_end(&mut text).map_err(unreadable)?;
-    serde_json::from_slice(&text).map_err(|error| {
-        // Python writes NaN and Infinity, which JSON does not know.
-        let line = text.split(|byte| *byte == b'\n').nth(error.line().saturating_sub(1)).unwrap_or(&[]);
-        let around = &line[error.column().saturating_sub(12).min(line.len())..(error.column() + 12).min(line.len())];
-        for word in ["NaN", "Infinity"] {
-            if error.is_syntax() && around.windows(word.len()).any(|window| window == word.as_bytes()) {
-                return ReconstructionError::NotFinite {
-                    path: path.to_owned(),
-                    value: word.to_owned(),
-                    place: format!("line {}, column {}", error.line(), error.column()),
-                };
+/// The shots with their photos, sorted by name. Shots of cameras that cannot be read are left out with a note.
+fn read_shots(
+    project: &dyn ProjectFolder,
+    source: &Path,
+    components: &[Component],
+    frame: &Frame,
+    finder: &PhotoFinder<'_>,
+    notes: &mut Vec<Note>,
+) -> Result<(Vec<Shot>, Vec<Photo>), ReadError> {
+    let mut pairs: Vec<(Shot, Photo)> = Vec::new();
+    let (mut missing, mut unreadable): (Vec<&str>, Vec<(&str, &str)>) = (Vec::new(), Vec::new());
+    let mut names = BTreeSet::new();
+    for component in components {
+        for (name, entry) in component.shots.iter().filter(|(name, _)| names.insert(name.as_str())) {
+            let camera_entry = camera_of(source, components, component, name, entry)?;
+            if !is_known(camera_entry) {
+                unreadable.push((name, &entry.camera));
+                continue;
             }
+            let original = camera(source, &entry.camera, camera_entry)?;
+            let Some(found) = finder.find(name, &original, notes)? else {
+                missing.push(name);
+                continue;
+            };
+            let pose = pose(source, name, entry, frame)?;
+            let path = project.path().join(found.place);
+            let photo = Photo { shot: name.clone(), path, header: found.header, camera: found.camera };
+            let shot = Shot { name: name.clone(), camera: photo.undistorted_camera(), pose, gnss_enu_m: gnss(entry) };
+            pairs.push((shot, photo));
         }
-        ReconstructionError::Malformed { path: path.to_owned(), what: error.to_string() }
+    }
+    if let Some((name, camera_name)) = unreadable.first() {
+        if pairs.len() < 2 {
+            // Refused by the name of the model.
+            let entry = components.iter().find_map(|component| component.cameras.get(*camera_name));
+            entry.map_or(Ok(()), |entry| camera(source, camera_name, entry).map(drop))?;
+        }
+        notes.push(Note {
+            code: "shots_left_out",
+            message: format!(
+                "{} shots, such as {name}, were taken by a camera of a model that cannot be read (`{camera_name}`, perhaps a \
+                 panorama) and are left out",
+                unreadable.len()
+            ),
+        });
+    }
+    if !missing.is_empty() {
+        return Err(missing_photos(project, source, &missing, names.len() - unreadable.len()));
+    }
+    pairs.sort_by(|a, b| a.0.name.cmp(&b.0.name));
+    Ok(pairs.into_iter().unzip())
+}
+
+fn camera_of<'a>(
+    source: &Path,
+    components: &'a [Component],
+    component: &'a Component,
+    shot: &str,
+    entry: &ShotEntry,
+) -> Result<&'a CameraEntry, ReconstructionError> {
+    let elsewhere = || components.iter().find_map(|component| component.cameras.get(&entry.camera));
+    component.cameras.get(&entry.camera).or_else(elsewhere).ok_or_else(|| ReconstructionError::Malformed {
+        path: source.to_owned(),
+        what: format!("shot {shot} names camera `{}`, which is not there", entry.camera),
     })
 }
 
+fn pose(source: &Path, shot: &str, entry: &ShotEntry, frame: &Frame) -> Result<Pose, ReconstructionError> {
+    let world = Pose::from_axis_angle(entry.rotation.into(), entry.translation.into());
+    let finite = entry.rotation.iter().chain(&entry.translation).all(|value| value.is_finite());
+    let local = if finite { frame.pose(world) } else { None };
+    local.ok_or_else(|| ReconstructionError::NotFinite {
+        path: source.to_owned(),
+        value: "a number that is not finite".to_owned(),
+        place: format!("pose of shot {shot}"),
+    })
+}
+
+/// The GNSS position of a shot, local frame, metres, where there was a fix. OpenSfM keeps it local in every frame of the
+/// reconstruction.
+fn gnss(entry: &ShotEntry) -> Option<Vector3<f64>> {
+    entry
+        .gps_position
+        .filter(|position| position.iter().all(|value| value.is_finite()))
+        .filter(|_| entry.gps_dop.is_none_or(|dop| dop < NO_FIX_DOP))
+        .map(Vector3::from)
+}
+
+/// Whether place and scale are known: OpenSfM leaves the reference at 0, 0 where no photo has a GNSS position, and the scale
+/// to chance.
+fn is_georeferenced(reference: GeodeticReference, shots: &[Shot]) -> bool {
+    let Lla { latitude_deg, longitude_deg, .. } = reference.origin;
+    shots.iter().any(|shot| shot.gnss_enu_m.is_some()) || latitude_deg != 0.0 || longitude_deg != 0.0
+}
+
+fn several_components(components: &[Component]) -> Option<Note> {
+    let counts = components.iter().map(|component| component.shots.len()).filter(|shots| *shots > 0);
+    let sizes: Vec<String> = counts.map(|shots| shots.to_string()).collect();
+    (sizes.len() > 1).then(|| Note {
+        code: "several_components",
+        message: format!(
+            "reconstruction.json holds {} components of {} shots, tied to each other by GNSS alone: benches seen from two of \
+             them may not fit together; fly with more overlap and reconstruct again",
+            sizes.len(),
+            sizes.join(" and ")
+        ),
+    })
+}
+
+/// The undistorted images: their names and cameras, as far as files list them.
+fn undistorted(files: &ProjectFiles) -> Result<Undistorted, ReconstructionError> {
+    let mut undistorted = Undistorted { images: files.undistorted_images.clone(), ..Undistorted::default() };
+    let names = files.undistorted.with_file_name("undistorted_shot_ids.json");
+    if names.is_file() {
+        undistorted.names = read_small(&names)?;
+    }
+    if files.undistorted.is_file() {
+        let components = read_components(&files.undistorted)?;
+        let mut known: BTreeMap<&str, Camera> = BTreeMap::new();
+        for (name, entry) in components.iter().flat_map(|component| &component.cameras) {
+            if is_known(entry) {
+                known.insert(name, camera(&files.undistorted, name, entry)?);
+            }
+        }
+        let shots = components.iter().flat_map(|component| &component.shots);
+        let cameras = shots.filter_map(|(name, shot)| Some((name.clone(), *known.get(shot.camera.as_str())?)));
+        undistorted.cameras = cameras.collect();
+    }
+    Ok(undistorted)
+}
+
 fn read_reference(
-    folder: &Path,
+    path: &Path,
     source: &Path,
     components: &[Component],
 ) -> Result<GeodeticReference, ReconstructionError> {
-    let path = folder.join("reference_lla.json");
     let (entry, path) = if path.is_file() {
-        (read_json::<ReferenceEntry>(&path, MAX_REFERENCE_BYTES)?, path)
+        (read_small::<ReferenceEntry>(path)?, path.to_owned())
     } else if let Some(entry) = components.iter().find_map(|component| component.reference_lla) {
         (entry, source.to_owned())
     } else {
-        return Err(ReconstructionError::Missing { path });
+        return Err(ReconstructionError::Missing { path: path.to_owned() });
     };
     let finite = [entry.latitude, entry.longitude, entry.altitude].iter().all(|value| value.is_finite());
     if !finite || entry.latitude.abs() > 90.0 || entry.longitude.abs() > 360.0 || entry.altitude.abs() > 1e5 {
@@ -250,122 +270,23 @@ fn read_reference(
     }))
 }
 
-fn camera(path: &Path, name: &str, entry: &CameraEntry) -> Result<Camera, ReconstructionError> {
-    let zero = |value: Option<f64>| value.unwrap_or(0.0);
-    let lens = match entry.projection_type.as_str() {
-        "perspective" | "simple_radial" | "radial" | "brown" => Lens::Radial {
-            k1: zero(entry.k1),
-            k2: zero(entry.k2),
-            k3: zero(entry.k3),
-            p1: zero(entry.p1),
-            p2: zero(entry.p2),
-        },
-        "fisheye" | "fisheye_opencv" => {
-            Lens::Fisheye { k: [zero(entry.k1), zero(entry.k2), zero(entry.k3), zero(entry.k4)] }
-        }
-        other => {
-            return Err(ReconstructionError::UnknownCameraModel {
-                path: path.to_owned(),
-                camera: name.to_owned(),
-                model: other.chars().take(64).collect(),
-            });
-        }
-    };
-    let malformed =
-        |what: &str| ReconstructionError::Malformed { path: path.to_owned(), what: format!("camera `{name}` {what}") };
-    let focal_x = entry.focal_x.or(entry.focal).ok_or_else(|| malformed("has no focal length"))?;
-    let focal_y = entry.focal_y.unwrap_or(focal_x);
-    let camera = Camera {
-        width_px: entry.width,
-        height_px: entry.height,
-        focal_x,
-        focal_y,
-        principal_x: zero(entry.c_x),
-        principal_y: zero(entry.c_y),
-        lens,
-    };
-    let numbers = [zero(entry.k1), zero(entry.k2), zero(entry.k3), zero(entry.k4), zero(entry.p1), zero(entry.p2)];
-    let sound = |focal: f64| focal.is_finite() && (1e-3..1e3).contains(&focal);
-    if !sound(focal_x) || !sound(focal_y) || !camera.principal_x.is_finite() || !camera.principal_y.is_finite() {
-        return Err(malformed("has a focal length or principal point that no camera has"));
-    }
-    if numbers.iter().any(|k| !k.is_finite() || k.abs() > 1e3) || entry.width == 0 || entry.height == 0 {
-        return Err(malformed("has a distortion or size that no camera has"));
-    }
-    Ok(camera)
-}
-
-/// The file that shows a shot, relative to the folder, with the camera of that file and its header: the undistorted image
-/// first, then the original one.
-fn find_photo(
-    project: &dyn ProjectFolder,
-    shot: &str,
-    original: Camera,
-    flat: Camera,
-    max_pixels: u64,
-) -> Result<Option<(PathBuf, Camera, PhotoHeader)>, PhotoError> {
-    if Path::new(shot).file_name().and_then(|name| name.to_str()) != Some(shot) {
-        return Ok(None);
-    }
-    let undistorted = Path::new("undistorted").join("images");
-    let undistorted = ["", ".jpg", ".tif", ".png"].map(|suffix| (undistorted.join(format!("{shot}{suffix}")), flat));
-    for (place, camera) in undistorted.into_iter().chain([(Path::new("images").join(shot), original)]) {
-        if let Some(header) = project.inspect(&place, max_pixels)? {
-            return Ok(Some((place, camera, header)));
-        }
-    }
-    Ok(None)
-}
-
-/// The camera at the size that the file really has; a note where the shape disagrees.
-fn fitted(camera: &Camera, shot: &str, header: PhotoHeader, notes: &mut Vec<super::Note>) -> Camera {
-    let (expected, found) = (
-        f64::from(camera.width_px) / f64::from(camera.height_px),
-        f64::from(header.width_px) / f64::from(header.height_px),
-    );
-    if (expected / found - 1.0).abs() > 0.01 {
-        notes.push(super::Note {
-            code: "image_shape_differs",
-            message: format!(
-                "{shot} is {} x {} pixels, but its camera was calibrated at {} x {}: is it rotated or cropped?",
-                header.width_px, header.height_px, camera.width_px, camera.height_px
-            ),
-        });
-    }
-    camera.resized(header.width_px, header.height_px)
-}
-
-fn missing_photos(project: &dyn ProjectFolder, source: &Path, missing: &[&str], shots: usize) -> super::ReadError {
+fn missing_photos(project: &dyn ProjectFolder, source: &Path, missing: &[&str], shots: usize) -> ReadError {
     let source = file_name(source);
     if missing.len() == shots {
-        return super::ReadError::OtherImages {
+        return ReadError::OtherImages {
             reconstruction: source,
             shot: missing[0].to_owned(),
-            image: project.images().into_iter().next().unwrap_or_else(|| "none at all".to_owned()),
+            image: project.images().first().map_or_else(|| "none at all".to_owned(), |place| file_name(place)),
         };
     }
-    super::ReadError::ShotWithoutImage {
+    ReadError::ShotWithoutImage {
         reconstruction: source,
         shots: missing.iter().take(5).map(|name| (*name).to_owned()).collect::<Vec<_>>().join(", "),
         count: missing.len(),
     }
 }
 
-/// Says so where the camera centres are far from where the GNSS receiver put them.
-fn implausible_gnss(reconstruction: &Reconstruction) -> Option<super::Note> {
-    let mut offsets: Vec<f64> =
-        reconstruction.shots.iter().filter_map(|shot| Some((shot.pose.center() - shot.gnss_enu_m?).norm())).collect();
-    offsets.sort_by(f64::total_cmp);
-    let median = *offsets.get(offsets.len() / 2)?;
-    (median > 20.0).then(|| super::Note {
-        code: "far_from_gnss",
-        message: format!(
-            "camera centres lie {median:.0} m (median) from their GNSS positions: is reference_lla.json of the same project?"
-        ),
-    })
-}
-
-impl From<PhotoError> for super::ReadError {
+impl From<PhotoError> for ReadError {
     fn from(error: PhotoError) -> Self {
         Self::Photo(error)
     }

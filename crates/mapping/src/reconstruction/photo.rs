@@ -6,7 +6,7 @@ use super::jpeg::{self, JpegError};
 use super::quality::{MEASURED_PX, Quality};
 use crate::geometry::Camera;
 use fast_image_resize as fir;
-use image::{DynamicImage, GrayImage, ImageError, ImageFormat, ImageReader, RgbImage};
+use image::{ColorType, DynamicImage, GrayImage, ImageDecoder, ImageError, ImageFormat, ImageReader, RgbImage};
 use nalgebra::Vector2;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -33,6 +33,17 @@ pub enum PhotoError {
         "{name} is {width} x {height} pixels, more than the {limit} pixels allowed: scale it down, or raise the limit"
     )]
     TooLarge { name: String, width: u32, height: u32, limit: u64 },
+    #[error(
+        "{name} is {} x {} pixels, but its camera was calibrated at {} x {}: it was turned after the reconstruction, by an \
+         image viewer perhaps; give the photo as the camera wrote it",
+        size_px[0], size_px[1], expected_px[0], expected_px[1]
+    )]
+    Turned { name: String, size_px: [u32; 2], expected_px: [u32; 2] },
+    #[error(
+        "{name} holds floating-point numbers, as thermal cameras write temperatures: it is no photo of modules; give the \
+         colour photo, or convert it to 8 bits"
+    )]
+    FloatingPoint { name: String },
     #[error("{name} is cut short: its image data ends early; copy it from the camera again")]
     Truncated { name: String },
 }
@@ -46,6 +57,8 @@ impl PhotoError {
             Self::WrongName { .. } => "image_format_mismatch",
             Self::TooLarge { .. } => "image_too_large",
             Self::Truncated { .. } => "image_truncated",
+            Self::Turned { .. } => "image_turned",
+            Self::FloatingPoint { .. } => "image_floating_point",
         }
     }
 }
@@ -183,7 +196,11 @@ fn png_size(mut file: File, name: &str) -> Result<[u32; 2], PhotoError> {
 fn tiff_size(file: File, name: &str) -> Result<[u32; 2], PhotoError> {
     let mut reader = ImageReader::new(BufReader::new(file));
     reader.set_format(ImageFormat::Tiff);
-    let (width, height) = reader.into_dimensions().map_err(|error| undecodable(name, error))?;
+    let decoder = reader.into_decoder().map_err(|error| undecodable(name, error))?;
+    if matches!(decoder.color_type(), ColorType::Rgb32F | ColorType::Rgba32F) {
+        return Err(PhotoError::FloatingPoint { name: name.to_owned() });
+    }
+    let (width, height) = decoder.dimensions();
     Ok([width, height])
 }
 
