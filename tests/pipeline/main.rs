@@ -5,6 +5,7 @@ mod boxes;
 mod broken;
 mod data;
 mod detect;
+mod projects;
 mod resume;
 mod survey;
 mod unusual;

@@ -6,7 +6,10 @@ use super::jpeg::{self, JpegError};
 use super::quality::{MEASURED_PX, Quality};
 use crate::geometry::Camera;
 use fast_image_resize as fir;
-use image::{ColorType, DynamicImage, GrayImage, ImageDecoder, ImageError, ImageFormat, ImageReader, RgbImage};
+use image::error::UnsupportedErrorKind;
+use image::{
+    ColorType, DynamicImage, ExtendedColorType, GrayImage, ImageDecoder, ImageError, ImageFormat, ImageReader, RgbImage,
+};
 use nalgebra::Vector2;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -40,8 +43,8 @@ pub enum PhotoError {
     )]
     Turned { name: String, size_px: [u32; 2], expected_px: [u32; 2] },
     #[error(
-        "{name} holds floating-point numbers, as thermal cameras write temperatures: it is no photo of modules; give the \
-         colour photo, or convert it to 8 bits"
+        "{name} holds 32-bit numbers, as thermal cameras write temperatures: it is no photo of modules; give the colour photo, \
+         or convert it to 8 bits"
     )]
     FloatingPoint { name: String },
     #[error("{name} is cut short: its image data ends early; copy it from the camera again")]
@@ -207,6 +210,12 @@ fn tiff_size(file: File, name: &str) -> Result<[u32; 2], PhotoError> {
 /// What it means that an image cannot be decoded.
 fn undecodable(name: &str, error: ImageError) -> PhotoError {
     match error {
+        // One channel of 32-bit numbers, which the decoder does not know.
+        ImageError::Unsupported(error)
+            if matches!(error.kind(), UnsupportedErrorKind::Color(ExtendedColorType::Unknown(32))) =>
+        {
+            PhotoError::FloatingPoint { name: name.to_owned() }
+        }
         ImageError::IoError(error) if error.kind() == std::io::ErrorKind::UnexpectedEof => {
             PhotoError::Truncated { name: name.to_owned() }
         }

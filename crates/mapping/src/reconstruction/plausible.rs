@@ -43,13 +43,11 @@ pub(super) fn check_cloud(path: &Path, reconstruction: &Reconstruction) -> Resul
     let centers: Vec<Vector3<f64>> = reconstruction.shots.iter().map(|shot| shot.pose.center()).collect();
     let sparse = &reconstruction.sparse_points_m;
     let ground = if sparse.len() >= MIN_POINTS { sparse.clone() } else { dense.clone() };
-    let height_m = match (
-        median(centers.iter().map(|c| c.z).collect()),
-        median(ground.iter().map(|point| point.z).collect()),
-    ) {
-        (Some(cameras), Some(ground)) => (cameras - ground).abs().max(1.0),
-        _ => return Ok(()),
-    };
+    let height_m =
+        match (median(centers.iter().map(|c| c.z).collect()), median(ground.iter().map(|point| point.z).collect())) {
+            (Some(cameras), Some(ground)) => (cameras - ground).abs().max(1.0),
+            _ => return Ok(()),
+        };
     let agrees = if sparse.len() >= MIN_POINTS {
         near_share(&dense, sparse, NEAR_SHARE * height_m) >= MIN_NEAR
     } else {

@@ -47,7 +47,9 @@ fn image(file: &Path, place: &SurveyPath, limits: &Limits) -> Result<Found, ApiE
         }
         Err(error) => Err(match error {
             PhotoError::Unreadable { source, .. } => disk(file, source),
-            PhotoError::NotAnImage { .. } => ApiError::new(Code::ImageUnreadable, error.to_string()),
+            PhotoError::NotAnImage { .. } | PhotoError::FloatingPoint { .. } | PhotoError::Turned { .. } => {
+                ApiError::new(Code::ImageUnreadable, error.to_string())
+            }
             PhotoError::WrongName { .. } => ApiError::new(Code::ImageFormatMismatch, error.to_string()),
             PhotoError::Truncated { .. } => ApiError::new(Code::ImageTruncated, error.to_string()),
             PhotoError::TooLarge { width, height, .. } => ApiError::new(

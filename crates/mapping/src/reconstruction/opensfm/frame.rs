@@ -98,7 +98,10 @@ impl Projected {
         let parsed = |text: &str| {
             Proj::from_proj_string(text).map_err(|error| ReconstructionError::Malformed {
                 path: path.to_owned(),
-                what: format!("its projection `{}` cannot be used: {error}", text.chars().take(100).collect::<String>()),
+                what: format!(
+                    "its projection `{}` cannot be used: {error}",
+                    text.chars().take(100).collect::<String>()
+                ),
             })
         };
         let mut frame = Self {
@@ -109,9 +112,8 @@ impl Projected {
             local_from_world: Rotation3::identity(),
         };
         let origin = frame.world_at(reference);
-        let axis = |direction: Vector3<f64>| {
-            Some((frame.enu_m(origin + direction * STEP_M)? - frame.enu_m(origin)?) / STEP_M)
-        };
+        let axis =
+            |direction: Vector3<f64>| Some((frame.enu_m(origin + direction * STEP_M)? - frame.enu_m(origin)?) / STEP_M);
         let axes = [axis(Vector3::x()), axis(Vector3::y()), axis(Vector3::z())];
         let [Some(x), Some(y), Some(z)] = axes else {
             return Err(ReconstructionError::NotLocal { path: path.to_owned(), east_m: origin.x, north_m: origin.y });
@@ -137,11 +139,8 @@ impl Projected {
     fn enu_m(&self, world_m: Vector3<f64>) -> Option<Vector3<f64>> {
         let mut point = (world_m.x + self.offset_m[0], world_m.y + self.offset_m[1], 0.0);
         transform(&self.projection, &self.geographic, &mut point).ok()?;
-        let position = Lla {
-            longitude_deg: point.0.to_degrees(),
-            latitude_deg: point.1.to_degrees(),
-            height_m: world_m.z,
-        };
+        let position =
+            Lla { longitude_deg: point.0.to_degrees(), latitude_deg: point.1.to_degrees(), height_m: world_m.z };
         let enu_m = self.reference.enu_from_lla(position);
         enu_m.iter().all(|value| value.is_finite()).then_some(enu_m)
     }
@@ -182,7 +181,8 @@ mod tests {
     fn utm_is_undone_to_a_millimetre_and_a_microradian() {
         // PROJ 9 gives (428979.8554, 5519085.3154) for longitude 14.0127, latitude 49.82 in EPSG:32633.
         let reference = GeodeticReference::new(Lla { latitude_deg: 49.82, longitude_deg: 14.0127, height_m: 0.0 });
-        let frame = Projected::new(Path::new("r.json"), &utm_of(reference), [428_000.0, 5_518_000.0], reference).unwrap();
+        let frame =
+            Projected::new(Path::new("r.json"), &utm_of(reference), [428_000.0, 5_518_000.0], reference).unwrap();
         let origin = frame.world_at(reference);
         assert!((origin - Vector3::new(979.8554, 1085.3154, 0.0)).norm() < 1e-3, "{origin}");
         assert!(frame.enu_m(origin).unwrap().norm() < 1e-3);
