@@ -20,7 +20,7 @@ const STEP_M: f64 = 100.0;
 pub(super) enum Frame {
     /// The world is the local frame.
     Local,
-    Projected(Projected),
+    Projected(Box<Projected>),
 }
 
 /// A world in UTM less an offset.
@@ -48,7 +48,7 @@ impl Frame {
         if let Some(folder) = georeferencing
             && let Some((definition, offset_m)) = coords(&folder.join("coords.txt"))
         {
-            return Ok(Self::Projected(Projected::new(path, &definition, offset_m, reference)?));
+            return Ok(Self::Projected(Box::new(Projected::new(path, &definition, offset_m, reference)?)));
         }
         let centers: Vec<Vector3<f64>> = components
             .iter()
@@ -64,7 +64,7 @@ impl Frame {
         if from_reference_m > MAX_FROM_REFERENCE_M {
             return Err(ReconstructionError::NotLocal { path: path.to_owned(), east_m: mean.x, north_m: mean.y });
         }
-        Ok(Self::Projected(projected))
+        Ok(Self::Projected(Box::new(projected)))
     }
 
     /// A point of the world in the local frame, metres; `None` where it is nowhere on earth.
