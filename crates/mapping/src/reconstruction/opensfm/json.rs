@@ -15,9 +15,7 @@ const MAX_SMALL_BYTES: u64 = 16 << 20;
 /// One component: what hangs together by common points.
 #[derive(Deserialize)]
 pub(super) struct Component {
-    #[serde(default)]
     pub(super) cameras: BTreeMap<String, CameraEntry>,
-    #[serde(default)]
     pub(super) shots: BTreeMap<String, ShotEntry>,
     #[serde(default)]
     pub(super) points: BTreeMap<String, PointEntry>,
