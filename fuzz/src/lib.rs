@@ -1,6 +1,4 @@
-//! What the fuzz targets share: files in memory, what an input may cost, and the service in this process.
-
-pub mod memory;
+//! What the fuzz targets share: files in memory, and the service in this process.
 
 use axum::Router;
 use axum::body::{Body, to_bytes};
