@@ -357,7 +357,7 @@ mod tests {
             benches: vec![rows],
             places_m: vec![Vector2::new(0.1 + 0.2, 1.0 / 3.0)],
         };
-        let fused = Fused { lines: Vec::new(), benches: Vec::new(), doubts: (0..12).map(bench).collect() };
+        let fused = Fused { doubts: (0..12).map(bench).collect(), ..Fused::default() };
         let watch = Watch::default();
         let of = "what was seen";
         watch.save_structure(&fused, of);

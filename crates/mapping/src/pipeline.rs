@@ -115,7 +115,7 @@ pub fn map_folder(
         .map(|((shot, detections), layout)| View { shot, detections, layout })
         .collect();
     let of = digest(&detections, &layouts);
-    let fused = match observer.load_structure(&of) {
+    let mut fused = match observer.load_structure(&of) {
         Some(fused) => fused,
         None => {
             let located = clock.stage(Stage::Locate, || fusion::locate::locate(&views, &cloud))?;
@@ -140,10 +140,11 @@ pub fn map_folder(
         spacing_m: options.spacing_m,
         module_size_m: options.module_size_m,
         seed: options.seed,
+        ..RefinementOptions::default()
     };
     let reference = project.reconstruction.reference;
     let refined = clock.stage(Stage::Refine, || -> Result<Refined, MapError> {
-        let mut refined = refinement::refine(&views, &fused, &refinement_options);
+        let mut refined = refinement::refine_verified(&views, &mut fused, &refinement_options);
         if let Some(control) = &options.control {
             let scale_known = options.spacing_m.is_some() || options.module_size_m.is_some();
             let with_scale = options.control_scale.unwrap_or(!scale_known);
@@ -165,11 +166,14 @@ pub fn map_folder(
     Ok(Mapping { model, timings, photos, shots, detections, layouts, fused, refined })
 }
 
+/// Changes with what [`Fused`] holds, so that checkpoints of an older program are discarded and not misread.
+const STRUCTURE_VERSION: u32 = 2;
+
 /// SHA-256 of the detections and layouts, hexadecimal: the key of the structure's checkpoint.
 fn digest(detections: &[ImageDetections], layouts: &[Layout]) -> String {
     let mut hashed = Hashed(Sha256::new());
     // Writing to a hash cannot fail.
-    let _ = ciborium::into_writer(&(detections, layouts), &mut hashed);
+    let _ = ciborium::into_writer(&(STRUCTURE_VERSION, detections, layouts), &mut hashed);
     hashed.0.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
 }
 

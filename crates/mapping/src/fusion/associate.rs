@@ -7,14 +7,16 @@
 //! that decides the rest.
 
 use super::apart::{Facing, aisle_between, facing, gap_between};
+use super::cameras::CameraQuality;
 use super::cluster::{Best, Link, Partition, Shift, Table, partition};
-use super::disparity::{Disparity, DisparityField};
+use super::disparity::{Disparity, DisparityField, PRIOR_SIGMA_M};
 use super::{Doubt, FusionOptions, LocatedPiece, OpenDoubt, View};
 use crate::layout::End;
-use nalgebra::Vector2;
+use nalgebra::{Matrix3, Vector2, Vector3};
 use rayon::prelude::*;
 use rstar::{AABB, RTree, primitives::GeomWithData};
 use std::collections::BTreeMap;
+use std::f64::consts::SQRT_2;
 
 /// Cost, in units of a negative log-likelihood, of one bench end that one view sees and the other contradicts.
 const END_COST: f64 = 4.0;
@@ -37,6 +39,9 @@ const DISPLACED: f64 = 0.25;
 /// Degrees of freedom of the positions' errors: few, for local errors of structure from motion have long tails.
 const TAIL: f64 = 4.0;
 
+/// How much more the height of a bench may disagree than its place, two views' errors being what they are.
+const HEIGHT_SHARE: f64 = 2.0;
+
 /// A shift under which two pieces may be the same: column and row of `b` are those of `a` plus this.
 #[derive(Debug, Clone, Copy)]
 struct Hypothesis {
@@ -49,6 +54,8 @@ struct Hypothesis {
     shares: bool,
     /// Position of a cell in `b` less that of the same cell in `a`, metres east and north.
     disparity_m: Vector2<f64>,
+    /// The same by their lattices in space, with its covariance, where both have one.
+    in_space: Option<(Vector3<f64>, Matrix3<f64>)>,
 }
 
 /// Two pieces of different views that overlap.
@@ -166,7 +173,7 @@ pub struct Clusters {
 }
 
 /// Finds the benches.
-pub fn associate(pieces: &[LocatedPiece], options: &FusionOptions) -> Clusters {
+pub(super) fn associate(pieces: &[LocatedPiece], cameras: Option<&CameraQuality>, options: &FusionOptions) -> Clusters {
     let near = near_pairs(pieces, options);
     let mut pairs: Vec<Pair> =
         near.par_iter().filter_map(|&(a, b)| pair(a, b, pieces, Vector2::zeros(), options)).collect();
@@ -174,13 +181,18 @@ pub fn associate(pieces: &[LocatedPiece], options: &FusionOptions) -> Clusters {
     let mut apart: Vec<Link> = facing.iter().filter_map(gap_between).collect();
     apart.par_extend(near.par_iter().filter_map(|&(a, b)| aisle_between(a, b, pieces)));
     let views = pieces.iter().map(|piece| piece.view + 1).max().unwrap_or(0);
-    let mut field = DisparityField::unknown(views);
+    let prior_m = cameras.map_or(PRIOR_SIGMA_M, |cameras| SQRT_2 * cameras.typical_m);
+    let mut field = DisparityField::unknown(views, prior_m);
+    let weigh = |k: usize, pair: &Pair, field: &DisparityField| match cameras {
+        Some(cameras) => geometric_table(k, pair, pieces, field, cameras, options),
+        None => table(k, pair, pieces, field),
+    };
     for needed in [SURE, LIKELY, LIKELY] {
         let known = disparities(&pairs, pieces, |k| {
-            let best = table(k, &pairs[k], pieces, &field).best()?;
+            let best = weigh(k, &pairs[k], &field).best()?;
             (best.margin >= needed).then_some(best.shift)
         });
-        field = DisparityField::fit(views, &known);
+        field = DisparityField::fit(views, &known, prior_m);
     }
     let mut outcome = None;
     for _ in 0..2 {
@@ -188,13 +200,13 @@ pub fn associate(pieces: &[LocatedPiece], options: &FusionOptions) -> Clusters {
         let mut links: Vec<Link> = pairs
             .par_iter()
             .enumerate()
-            .map(|(k, pair)| Link { a: pair.a, b: pair.b, table: table(k, pair, pieces, &field) })
+            .map(|(k, pair)| Link { a: pair.a, b: pair.b, table: weigh(k, pair, &field) })
             .collect();
         links.extend(apart.iter().cloned());
         let joined = partition(pieces, &links, LIKELY);
         // All joints together know more of the displacements than single pairs did.
         let known = disparities(&pairs, pieces, |k| joined.between(pairs[k].a, pairs[k].b));
-        field = DisparityField::fit(views, &known);
+        field = DisparityField::fit(views, &known, prior_m);
         outcome = Some((joined, links));
     }
     match outcome {
@@ -253,6 +265,52 @@ fn table(index: usize, pair: &Pair, pieces: &[LocatedPiece], field: &DisparityFi
     // Two that show no module in common need not be of one bench, wherever they stand.
     let apart = pair.hypotheses.iter().filter(|h| !h.shares).map(&cost).fold(DIFFERENT_COST, f64::min);
     Table::new(pair.hypotheses.iter().map(|h| ((h.col, h.row), cost(h))), FAR_COST, apart)
+}
+
+/// What a pair says of every shift where cameras are good: rays of the same module meet, those of neighbours do not.
+fn geometric_table(
+    index: usize,
+    pair: &Pair,
+    pieces: &[LocatedPiece],
+    field: &DisparityField,
+    cameras: &CameraQuality,
+    options: &FusionOptions,
+) -> Table {
+    let (a, b) = (&pieces[pair.a], &pieces[pair.b]);
+    let (expected, field_sigma) = field.expected(index, (a.view, b.view), pair.at_m);
+    // A view that is worse than the others stays so.
+    let extra = (cameras.between(a.view, b.view).powi(2) - 2.0 * cameras.typical_m.powi(2)).max(0.0);
+    let sigma = (field_sigma.powi(2) + extra).sqrt();
+    let dof = options.params.disagreement_dof;
+    let cost = |hypothesis: &Hypothesis| {
+        let off = match &hypothesis.in_space {
+            Some((off, covariance)) => {
+                let off = off - Vector3::new(expected.x, expected.y, 0.0);
+                let height = HEIGHT_SHARE * sigma;
+                let shared = Vector3::new(sigma * sigma, sigma * sigma, height * height);
+                (covariance + Matrix3::from_diagonal(&shared)).cholesky().map_or(0.0, |c| off.dot(&c.solve(&off)))
+            }
+            None => {
+                let sigma = (sigma.powi(2) + a.sigma_m.powi(2) + b.sigma_m.powi(2)).sqrt();
+                ((hypothesis.disparity_m - expected).norm() / sigma).powi(2)
+            }
+        };
+        hypothesis.structure_cost + (dof + 3.0) / 2.0 * (1.0 + off / dof).ln()
+    };
+    let apart = pair.hypotheses.iter().filter(|h| !h.shares).map(&cost).fold(DIFFERENT_COST, f64::min);
+    Table::new(pair.hypotheses.iter().map(|h| ((h.col, h.row), cost(h))), FAR_COST, apart)
+}
+
+/// Where the lattice of `b` has a place that both show, or that lies between them, less where that of `a` has it, metres, with
+/// the covariance.
+fn in_space(a: &LocatedPiece, b: &LocatedPiece, col: i32, row: i32) -> Option<(Vector3<f64>, Matrix3<f64>)> {
+    let (first, second) = (a.lattice.as_ref()?, b.lattice.as_ref()?);
+    // The middle of what is common, or of what lies between.
+    let middle = |size: i32, other: i32, shift: i32| f64::from(0.max(-shift) + (size - 1).min(other - 1 - shift)) / 2.0;
+    let (at_col, at_row) = (middle(a.cols, b.cols, col), middle(a.rows, b.rows, row));
+    let (other_col, other_row) = (at_col + f64::from(col), at_row + f64::from(row));
+    let off = second.position(other_col, other_row) - first.position(at_col, at_row);
+    Some((off, first.covariance(at_col, at_row) + second.covariance(other_col, other_row)))
 }
 
 /// The benches of a partition, numbered by their first piece, with what it leaves open.
@@ -338,7 +396,7 @@ fn undecided(joined: &Partition, links: &[Link], number: &BTreeMap<usize, usize>
 }
 
 /// All pairs of pieces whose footprints come near each other.
-fn near_pairs(pieces: &[LocatedPiece], options: &FusionOptions) -> Vec<(usize, usize)> {
+pub(super) fn near_pairs(pieces: &[LocatedPiece], options: &FusionOptions) -> Vec<(usize, usize)> {
     let boxes: Vec<GeomWithData<rstar::primitives::Rectangle<[f64; 2]>, usize>> = pieces
         .iter()
         .enumerate()
@@ -454,12 +512,14 @@ fn pair(
             if disparity_m.norm().min((disparity_m - expected_m).norm()) > options.max_disparity_m {
                 continue;
             }
+            let in_space = in_space(first, second, col, row);
+            let disparity_m = in_space.map_or(disparity_m, |(off, _)| off.xy());
             let (mut structure_cost, shares) = structure_cost(first, second, col, row, options);
             if !shares {
                 // Beside each other they may as well be two benches: nothing is contradicted.
                 structure_cost = structure_cost.min(APART_COST);
             }
-            hypotheses.push(Hypothesis { col, row, structure_cost, shares, disparity_m });
+            hypotheses.push(Hypothesis { col, row, structure_cost, shares, disparity_m, in_space });
         }
     }
     hypotheses.iter().any(|hypothesis| hypothesis.shares).then_some(Pair { a, b, at_m, hypotheses })
@@ -481,7 +541,11 @@ fn structure_cost(a: &LocatedPiece, b: &LocatedPiece, col: i32, row: i32, option
     }
     cost += (f64::from(holes) * HOLE_COST).min(3.0 * HOLE_COST + 0.1 * f64::from(holes));
     // `beyond` columns of one piece lie past the end of the other.
+    // Where geometry speaks no end weighs more than the share of ends that are seen wrongly, however far off it is.
+    let most =
+        if a.lattice.is_some() && b.lattice.is_some() { -options.params.false_end_share.ln() } else { f64::INFINITY };
     let mut end = |mine: End, theirs: End, beyond: i32| {
+        let before = cost;
         let contradicted = if beyond > 0 { mine } else { theirs };
         if beyond != 0 && contradicted == End::Closed {
             cost += END_COST + END_COLUMN_COST * f64::from(beyond.abs() - 1).min(4.0);
@@ -490,6 +554,7 @@ fn structure_cost(a: &LocatedPiece, b: &LocatedPiece, col: i32, row: i32, option
                 cost += 1.0;
             }
         }
+        cost = cost.min(before + most);
     };
     end(a.west, b.west, col);
     end(a.east, b.east, (b.cols - 1) - (a.cols - 1 + col));

@@ -3,8 +3,10 @@
 use nalgebra::Vector2;
 use std::collections::BTreeMap;
 
-/// Standard deviation of the disagreement of two views before anything is known of them, metres.
-const PRIOR_SIGMA_M: f64 = 0.35;
+/// Standard deviation of the disagreement of two views where nothing is known of the cameras, metres.
+pub(super) const PRIOR_SIGMA_M: f64 = 0.35;
+/// Least one that is learned, metres.
+const LEAST_SIGMA_M: f64 = 0.05;
 /// Within about this distance disagreements are alike, metres.
 const ALIKE_M: f64 = 15.0;
 
@@ -33,13 +35,13 @@ struct Residual {
 }
 
 impl DisparityField {
-    pub(super) fn unknown(views: usize) -> Self {
-        Self { offset_m: vec![Vector2::zeros(); views], sigma_m: PRIOR_SIGMA_M, local: BTreeMap::new() }
+    pub(super) fn unknown(views: usize, prior_m: f64) -> Self {
+        Self { offset_m: vec![Vector2::zeros(); views], sigma_m: prior_m, local: BTreeMap::new() }
     }
 
     /// Fits the displacement of each view (Gauss-Seidel on the normal equations, with a weak pull to nought), robustly.
-    pub(super) fn fit(views: usize, known: &[Disparity]) -> Self {
-        let mut field = Self::unknown(views);
+    pub(super) fn fit(views: usize, known: &[Disparity], prior_m: f64) -> Self {
+        let mut field = Self::unknown(views, prior_m);
         if known.is_empty() {
             return field;
         }
@@ -54,7 +56,7 @@ impl DisparityField {
                 for &k in members {
                     let Disparity { views: (a, b), value_m, .. } = known[k];
                     let target = if b == view { field.offset_m[a] + value_m } else { field.offset_m[b] - value_m };
-                    let robust = 1.0 / (1.0 + ((target - field.offset_m[view]).norm() / PRIOR_SIGMA_M).powi(2));
+                    let robust = 1.0 / (1.0 + ((target - field.offset_m[view]).norm() / prior_m).powi(2));
                     sum += target * robust;
                     weight += robust;
                 }
@@ -76,7 +78,7 @@ impl DisparityField {
         // Median of a Rayleigh distribution is 1.18 sigma.
         let spread = residuals[residuals.len() / 2] / 1.18;
         let trust = known.len() as f64 / (known.len() as f64 + 6.0);
-        field.sigma_m = (spread * trust + PRIOR_SIGMA_M * (1.0 - trust)).clamp(0.05, PRIOR_SIGMA_M);
+        field.sigma_m = (spread * trust + prior_m * (1.0 - trust)).clamp(LEAST_SIGMA_M.min(prior_m), prior_m);
         field
     }
 

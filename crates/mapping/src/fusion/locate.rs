@@ -5,6 +5,7 @@
 //! modules without points under glare, or with points on the ground below, stand where their neighbours say.
 
 use super::View;
+use super::piece_lattice::PieceLattice;
 use crate::geometry::point_cloud::CloudIndex;
 use crate::geometry::{Camera, PointCloud, Pose};
 use crate::layout::lattice::Sample;
@@ -49,6 +50,8 @@ pub struct LocatedPiece {
     pub ground: LatticeMap,
     /// How well the cloud tells where the piece stands, one standard deviation in the horizontal plane, metres.
     pub sigma_m: f64,
+    /// Where it stands by its boxes, once the pitch of its type is known.
+    pub(super) lattice: Option<Box<PieceLattice>>,
 }
 
 impl LocatedPiece {
@@ -395,6 +398,7 @@ fn located_piece(
         bridges: piece.bridges.clone(),
         ground: piece.map.clone(),
         sigma_m: cloud_sigma_m(&cells),
+        lattice: None,
         cells,
     };
     located.refit(fallback);

@@ -4,16 +4,21 @@
 mod apart;
 pub mod associate;
 pub mod benches;
+mod cameras;
 mod cluster;
 mod disparity;
 pub mod lines;
 pub mod locate;
+mod piece_lattice;
+mod pitch;
+mod relocate;
 pub mod repair;
 
 use crate::detection::ImageDetections;
 use crate::layout::Layout;
 use crate::reconstruction::Shot;
 pub use benches::{FusedBench, FusedModule, Observation};
+use cameras::CameraQuality;
 pub use lines::FusedLine;
 pub use locate::{Located, LocatedPiece};
 use nalgebra::Vector2;
@@ -36,11 +41,96 @@ pub struct FusionOptions {
     pub rows_per_bench: Option<u32>,
     /// How far the same point, located from two images, may lie apart, metres (the paper's raw models err by 0.6 m).
     pub max_disparity_m: f64,
+    pub params: FusionParams,
 }
 
 impl Default for FusionOptions {
     fn default() -> Self {
-        Self { rows_per_bench: None, max_disparity_m: 1.3 }
+        Self { rows_per_bench: None, max_disparity_m: 1.3, params: FusionParams::default() }
+    }
+}
+
+/// How geometry decides which modules are the same. Values are measured on the twins of the paper's plants and on
+/// simulated flights unless another source is given.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FusionParams {
+    /// Standard deviation of the centre of a box, pixels, before it is measured.
+    pub box_sigma_px: f64,
+    /// Least standard deviation of what all boxes of a piece have in common, pixels (detectors see the edge of a table
+    /// otherwise than a seam).
+    pub shared_sigma_px: f64,
+    /// How well a piece's depth is known by cloud or ground before its pitch tells, metres: sparse points lie on the ground,
+    /// one to two metres below the tables.
+    pub depth_sigma_m: f64,
+    /// Slope of a row against the cloud's surface, radians: terrain.
+    pub slope_sigma: f64,
+    /// How far a bench bends from straight over half its length, metres.
+    pub bend_sigma_m: f64,
+    /// How far from a right angle a table may be, as the cosine.
+    pub square_sigma: f64,
+    /// Boxes that a piece needs to take part in measuring the pitch.
+    pub pitch_least_boxes: usize,
+    /// Least angle between the rays of two views that measure it, radians.
+    pub pitch_least_angle_rad: f64,
+    /// Most pairs of pieces that are triangulated for it.
+    pub pitch_most_pairs: usize,
+    /// How far shifts are tried about the positions by the cloud, metres.
+    pub pitch_reach_m: f64,
+    /// Most mean squared residual of a triangulated pair, in variances of a box.
+    pub pitch_most_residual: f64,
+    /// Relative width in which pitches count as equal.
+    pub pitch_window: f64,
+    /// Relative standard deviation of a pitch by the cloud's depth alone.
+    pub pitch_rough_sigma: f64,
+    /// Least number and share of the pairs that make a type of bench.
+    pub pitch_least_pairs: usize,
+    pub pitch_least_share: f64,
+    /// Share of the pairs left that must agree; by mere chance 5 to 16 % do.
+    pub pitch_agreeing_share: f64,
+    /// Least relative standard deviation of a pitch.
+    pub pitch_least_sigma: f64,
+    /// Least standard deviation of the rise of a table across its rows, as the sine of its tilt.
+    pub rise_least_sigma: f64,
+    /// Most types of bench.
+    pub most_types: usize,
+    /// Degrees of freedom of the disagreement of two lattices (Student's t): boxes may err together in ways not foreseen.
+    pub disagreement_dof: f64,
+    /// Cameras are good where they disagree by no more than this share of a pitch: then one pair of pieces decides by itself
+    /// (integer ambiguities are fixed at 0.15 cycles, Teunissen 1998).
+    pub good_camera_pitches: f64,
+    /// Least standard deviation of the disagreement of two cameras on the ground, metres.
+    pub camera_least_m: f64,
+    /// Share of the bench ends that a view sees wrongly (boxes missed in clusters): no end weighs more than its logarithm.
+    pub false_end_share: f64,
+}
+
+impl Default for FusionParams {
+    fn default() -> Self {
+        Self {
+            box_sigma_px: 1.0,
+            shared_sigma_px: 0.3,
+            depth_sigma_m: 3.0,
+            slope_sigma: 0.05,
+            bend_sigma_m: 0.1,
+            square_sigma: 0.003,
+            pitch_least_boxes: 8,
+            pitch_least_angle_rad: 0.1,
+            pitch_most_pairs: 3000,
+            pitch_reach_m: 2.5,
+            pitch_most_residual: 25.0,
+            pitch_window: 0.002,
+            pitch_rough_sigma: 0.04,
+            pitch_least_pairs: 6,
+            pitch_least_share: 0.1,
+            pitch_agreeing_share: 0.25,
+            pitch_least_sigma: 0.0015,
+            rise_least_sigma: 0.03,
+            most_types: 8,
+            disagreement_dof: 8.0,
+            good_camera_pitches: 0.15,
+            camera_least_m: 0.02,
+            false_end_share: 0.03,
+        }
     }
 }
 
@@ -82,19 +172,22 @@ fn close(doubts: Vec<OpenDoubt>, benches: &[FusedBench]) -> Vec<Doubt> {
 }
 
 /// The structure of the whole plant.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct Fused {
     /// Lines from the north (or, where rows run north-south, from the east).
     pub lines: Vec<FusedLine>,
     pub benches: Vec<FusedBench>,
     pub doubts: Vec<Doubt>,
+    /// How well each view's camera is known: standard deviation of what it displaces on the ground, metres. Empty where that
+    /// could not be measured.
+    pub camera_sigma_m: Vec<f64>,
 }
 
 /// Fuses located pieces into the structure of the plant. The result does not depend on the order of the views.
 pub fn fuse(views: &[View<'_>], located: Located, options: &FusionOptions) -> Fused {
     let mut doubts = Vec::new();
-    let mut pieces = located.pieces;
-    let mut clusters = associate::associate(&pieces, options);
+    let (mut pieces, cameras) = by_geometry(views, located.pieces, options);
+    let mut clusters = associate::associate(&pieces, cameras.as_ref(), options);
     // A keypoint missed in one image lets one piece run over two benches; the other images tell where to split it.
     for _ in 0..3 {
         let splits = repair::missed_gaps(&pieces, &clusters);
@@ -102,12 +195,36 @@ pub fn fuse(views: &[View<'_>], located: Located, options: &FusionOptions) -> Fu
             break;
         }
         pieces = repair::split(pieces, &splits);
-        clusters = associate::associate(&pieces, options);
+        clusters = associate::associate(&pieces, cameras.as_ref(), options);
     }
     doubts.extend(clusters.doubts.iter().map(|doubt| doubt.describe(views, &pieces, &clusters)));
     let benches = benches::assemble(views, &pieces, &clusters, &mut doubts);
     let benches = benches::without_ghosts(views, benches, &mut doubts);
     let (lines, benches) = lines::arrange(benches, &mut doubts);
     let doubts = close(doubts, &benches);
-    Fused { lines, benches, doubts }
+    let camera_sigma_m = cameras.map_or_else(Vec::new, |cameras| cameras.sigma_m);
+    Fused { lines, benches, doubts, camera_sigma_m }
+}
+
+/// Pieces where their boxes and the pitch of their type put them, and how well the cameras agree; where the cameras are too
+/// poor for that, or pitches cannot be measured, the pieces as they are.
+fn by_geometry(
+    views: &[View<'_>],
+    pieces: Vec<LocatedPiece>,
+    options: &FusionOptions,
+) -> (Vec<LocatedPiece>, Option<CameraQuality>) {
+    let params = &options.params;
+    let near = associate::near_pairs(&pieces, options);
+    let types = pitch::types(views, &pieces, &near, params);
+    if types.is_empty() {
+        return (pieces, None);
+    }
+    let mut moved = pieces.clone();
+    relocate::relocate(views, &mut moved, &types, params);
+    let near = associate::near_pairs(&moved, options);
+    let cameras = cameras::measure(views.len(), &moved, &near, params);
+    match cameras.filter(|cameras| cameras.pitches < params.good_camera_pitches) {
+        Some(cameras) => (moved, Some(cameras)),
+        None => (pieces, None),
+    }
 }

@@ -12,10 +12,11 @@ use super::normal::{Group, Normal, Sight, Spreads, Step};
 use super::spacing::{self, Spacing};
 use super::uncertainty::{self, Uncertainty};
 use super::views::AdjustedView;
-use super::{Refined, RefinedBench, RefinedModule};
-use crate::fusion::{FusedBench, View};
+use super::{Refined, RefinedBench, RefinedModule, RefinementParams};
+use crate::fusion::{Fused, FusedBench, View};
 use nalgebra::{Vector2, Vector3};
 use rayon::prelude::*;
+use std::cmp::Ordering;
 
 /// Standard deviation of a corner in units of that of a centre.
 const CORNER_SPREAD: f32 = 3.0;
@@ -37,8 +38,9 @@ const SETTLED: f64 = 0.05;
 const SAMPLED: usize = 200_000;
 
 /// Refines all benches.
-pub(super) fn refine(views: &[View<'_>], benches: &[FusedBench]) -> Refined {
-    let mut problem = Problem::new(views, benches);
+pub(super) fn refine(views: &[View<'_>], fused: &Fused, params: &RefinementParams) -> Refined {
+    let benches = &fused.benches;
+    let mut problem = Problem::new(views, benches, &fused.camera_sigma_m, *params);
     problem.solve();
     let uncertainties =
         uncertainty::of_benches(&problem.linearised(), &problem.lattices, &problem.views, &problem.spreads);
@@ -61,6 +63,9 @@ struct Problem {
     /// How well the cloud knows the place of a bench, one standard deviation, metres.
     cloud_m: f64,
     spacings: Vec<Spacing>,
+    /// The typical camera's measured quality: what it displaces on the ground, metres.
+    camera_m: Option<f64>,
+    params: RefinementParams,
 }
 
 /// Where the cloud has a bench: the lattice that fits its points.
@@ -71,7 +76,8 @@ struct Anchor {
 }
 
 impl Problem {
-    fn new(views: &[View<'_>], benches: &[FusedBench]) -> Self {
+    fn new(views: &[View<'_>], benches: &[FusedBench], camera_sigma_m: &[f64], params: RefinementParams) -> Self {
+        let camera_m = median(camera_sigma_m.to_vec());
         let lattices: Vec<Lattice> = benches.par_iter().map(|bench| Lattice::start(views, bench)).collect();
         let mut groups: Vec<Vec<Group>> =
             benches.par_iter().zip(&lattices).map(|(bench, lattice)| groups_of(views, bench, lattice)).collect();
@@ -84,7 +90,8 @@ impl Problem {
         let adjusted: Vec<AdjustedView> = views
             .par_iter()
             .zip(&groups_of_view)
-            .map(|(view, members)| {
+            .enumerate()
+            .map(|(index, (view, members))| {
                 let shown = members.iter().flat_map(|&(bench, place)| {
                     let lattice = &lattices[bench];
                     groups[bench][place].sights.iter().map(|sight| {
@@ -92,7 +99,8 @@ impl Problem {
                         lattice.position(c, r)
                     })
                 });
-                AdjustedView::new(view, shown)
+                let quality = camera_m.map_or(1.0, |typical_m| camera_sigma_m[index] / typical_m);
+                AdjustedView::new(view, shown, quality)
             })
             .collect();
         // Where a view displaces a bench, all its modules are displaced alike.
@@ -123,11 +131,14 @@ impl Problem {
             spreads: Spreads {
                 center_px: 1.0,
                 group_px: (median(offsets).unwrap_or(1.0) / 1.18).clamp(1.0, 60.0),
-                pose_m: FIRST_POSE_M,
+                shared_px: if camera_m.is_some() { params.shared_px } else { 0.0 },
+                pose_m: if camera_m.is_some() { params.fixed_pose_m } else { FIRST_POSE_M },
             },
             anchors,
             cloud_m: FIRST_CLOUD_M,
             spacings,
+            camera_m,
+            params,
         };
         problem.spreads.center_px = problem.center_spread_px();
         problem
@@ -152,12 +163,13 @@ impl Problem {
             self.spreads = Spreads {
                 center_px: self.center_spread_px(),
                 group_px: self.group_spread_px(&normal, before.group_px),
-                pose_m: self.pose_spread_m(&normal, before.pose_m),
+                shared_px: before.shared_px,
+                pose_m: self.next_pose_m(round, &normal, before.pose_m),
             };
             self.cloud_m = self.cloud_spread_m();
             spacing::update(&mut self.spacings, &self.lattices);
             let settled = |new: f64, old: f64| (new / old - 1.0).abs() < SETTLED;
-            if round >= 3
+            if round >= self.params.fixed_rounds.max(3) + usize::from(self.camera_m.is_some())
                 && moved_m < SETTLED_M
                 && settled(self.spreads.center_px, before.center_px)
                 && settled(self.spreads.group_px, before.group_px)
@@ -261,12 +273,22 @@ impl Problem {
         median(off).map_or(FIRST_CLOUD_M, |off_m| 3.0 * off_m).clamp(BEST_CLOUD_M, FIRST_CLOUD_M)
     }
 
+    /// The same for the next round: where the cameras' quality is known they stand still at first, and never stray beyond it.
+    fn next_pose_m(&self, round: usize, normal: &Normal, before_m: f64) -> f64 {
+        let Some(camera_m) = self.camera_m else { return self.pose_spread_m(normal, before_m) };
+        match (round + 1).cmp(&self.params.fixed_rounds) {
+            Ordering::Less => self.params.fixed_pose_m,
+            Ordering::Equal => camera_m,
+            Ordering::Greater => self.pose_spread_m(normal, before_m).min(self.params.most_pose_factor * camera_m),
+        }
+    }
+
     /// Standard deviation of the poses' errors as they move the ground, likewise.
     fn pose_spread_m(&self, normal: &Normal, before_m: f64) -> f64 {
         let variances = uncertainty::pose_variances(normal, self.views.len());
         let (mut squares, mut determined) = (0.0, 0.0);
         for (view, variance) in self.views.iter().zip(variances) {
-            let scale = view.correction_scale();
+            let scale = view.prior_scale();
             for k in 0..6 {
                 squares += (view.correction()[k] / scale[k]).powi(2);
                 determined += (1.0 - variance[k] / (before_m * scale[k]).powi(2)).clamp(0.0, 1.0);

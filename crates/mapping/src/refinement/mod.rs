@@ -2,12 +2,14 @@
 
 mod adjustment;
 pub mod alignment;
+mod consensus;
 mod lattice;
 mod normal;
 mod paper;
 mod scale;
 mod spacing;
 mod uncertainty;
+mod verify;
 mod views;
 
 use crate::fusion::{Fused, View};
@@ -17,6 +19,7 @@ use heliomap_model::Alignment;
 use nalgebra::{Rotation3, Vector3};
 pub use scale::Scaled;
 use serde::{Deserialize, Serialize};
+pub use verify::refine_verified;
 
 /// How positions are refined.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -39,6 +42,42 @@ pub struct RefinementOptions {
     pub module_size_m: Option<[f64; 2]>,
     /// Seed of the paper's RANSAC.
     pub seed: u64,
+    pub params: RefinementParams,
+}
+
+/// How far an adjustment may go.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RefinementParams {
+    /// First rounds of the adjustment, in which cameras stand still, so that what does not fit loses its weight before any
+    /// camera can move to please it.
+    pub fixed_rounds: usize,
+    /// What the ground may be displaced by a camera in these rounds, one standard deviation, metres.
+    pub fixed_pose_m: f64,
+    /// How far the spread of the cameras' corrections may exceed their measured quality, as a factor: the measurement itself is
+    /// right to about a half.
+    pub most_pose_factor: f64,
+    /// Standard deviation of what the boxes of one view on one bench have in common besides an offset, pixels.
+    pub shared_px: f64,
+    /// Most times that what does not fit is matched anew and all is adjusted again.
+    pub most_verifications: usize,
+    /// How far from a module a sighting may lie that shows it, as a share of the pitch.
+    pub most_rest_pitches: f64,
+    /// Sightings of one view on one bench that must agree on another place to be moved there.
+    pub least_moved: usize,
+}
+
+impl Default for RefinementParams {
+    fn default() -> Self {
+        Self {
+            fixed_rounds: 3,
+            fixed_pose_m: 0.005,
+            most_pose_factor: 1.5,
+            shared_px: 0.3,
+            most_verifications: 4,
+            most_rest_pitches: 0.3,
+            least_moved: 3,
+        }
+    }
 }
 
 /// A module in space.
@@ -118,7 +157,7 @@ impl Refined {
 /// Refines every bench.
 pub fn refine(views: &[View<'_>], fused: &Fused, options: &RefinementOptions) -> Refined {
     let mut refined = match options.method {
-        Method::Lattice => adjustment::refine(views, &fused.benches),
+        Method::Lattice => adjustment::refine(views, fused, &options.params),
         Method::Paper => Refined {
             benches: paper::refine(views, &fused.benches, options.seed),
             poses: views.iter().map(|view| view.shot.pose).collect(),

@@ -43,6 +43,8 @@ pub(super) struct Spreads {
     pub(super) group_px: f64,
     /// Of the ground that a view shows, by the error of its pose, metres.
     pub(super) pose_m: f64,
+    /// Of what the boxes of one group have in common besides its offset (they are stretched or sheared together), pixels.
+    pub(super) shared_px: f64,
 }
 
 pub(super) type Cross = SMatrix<f64, PARAMS, 6>;
@@ -120,7 +122,7 @@ impl Normal {
         let (rows, right) = (0..views.len())
             .into_par_iter()
             .map(|view| {
-                let scale = views[view].correction_scale() * spreads.pose_m;
+                let scale = views[view].prior_scale() * spreads.pose_m;
                 let prior = scale.map(|sigma| 1.0 / (sigma * sigma));
                 let mut right = -prior.component_mul(views[view].correction());
                 let mut row: BTreeMap<usize, Matrix6<f64>> = BTreeMap::new();
@@ -305,6 +307,8 @@ fn group_terms(
     let mut by_view = OffsetByView::zeros();
     let mut offset_right = Vector2::zeros();
     let mut information = group.trust(spreads) / (spreads.group_px * spreads.group_px);
+    // However many boxes there are, their common errors do not average out: those of four numbers, say.
+    let shared = spreads.shared_px * spreads.shared_px * group.sights.len() as f64 / 4.0;
     for sight in &group.sights {
         let [c, r] = sight.place.map(f64::from);
         let factors = lattice.factors(c, r);
@@ -312,7 +316,7 @@ fn group_terms(
         let Some(look) = view.look(&position) else { continue };
         let rest = sight.seen_px - look.pixel;
         let sigma = spreads.center_px * f64::from(sight.spread);
-        let weight = cauchy((rest - group.offset_px).norm_squared() / (sigma * sigma)) / (sigma * sigma);
+        let weight = cauchy((rest - group.offset_px).norm_squared() / (sigma * sigma)) / (sigma * sigma + shared);
         let mut by_pose = OffsetByView::zeros();
         by_pose.fixed_columns_mut::<3>(0).copy_from(&look.by_turn);
         by_pose.fixed_columns_mut::<3>(3).copy_from(&look.by_shift);

@@ -74,7 +74,7 @@ fn pose_covariance(
 ) -> DMatrix<f64> {
     let size = 6 * window.len();
     // In units of what a pose may err, in which all numbers are of one kind.
-    let unit: Vec<Vector6<f64>> = window.iter().map(|view| views[*view].correction_scale() * spreads.pose_m).collect();
+    let unit: Vec<Vector6<f64>> = window.iter().map(|view| views[*view].prior_scale() * spreads.pose_m).collect();
     let mut matrix = DMatrix::<f64>::zeros(size, size);
     for (i, &view) in window.iter().enumerate() {
         for (j, &other) in window.iter().enumerate() {

@@ -18,6 +18,8 @@ pub(super) struct AdjustedView {
     pivot: Vector3<f64>,
     /// How far what it shows reaches about the pivot, metres (root mean square).
     reach_m: f64,
+    /// How much the pose may err, in units of the typical view's.
+    quality: f64,
     /// Turn (radians, camera axes) and shift (metres, camera axes).
     correction: Vector6<f64>,
     /// The corrected pose.
@@ -27,7 +29,7 @@ pub(super) struct AdjustedView {
 
 impl AdjustedView {
     /// A view as it is, about the middle of the points that it shows (world, metres).
-    pub(super) fn new(view: &View<'_>, shown_m: impl Iterator<Item = Vector3<f64>>) -> Self {
+    pub(super) fn new(view: &View<'_>, shown_m: impl Iterator<Item = Vector3<f64>>, quality: f64) -> Self {
         let Shot { pose, camera, .. } = view.shot;
         let (mut count, mut sum, mut squares) = (0.0_f64, Vector3::zeros(), 0.0);
         for point in shown_m {
@@ -47,6 +49,7 @@ impl AdjustedView {
             principal_px: camera.pixel_from_normalised(0.0, 0.0),
             pivot,
             reach_m: reach_m.max(2.0),
+            quality,
             correction: Vector6::zeros(),
             adjusted_rotation: rotation,
             adjusted_translation: pose.translation_m,
@@ -74,6 +77,11 @@ impl AdjustedView {
     pub(super) fn correction_scale(&self) -> Vector6<f64> {
         let turn = 1.0 / self.reach_m;
         Vector6::new(turn, turn, turn, 1.0, 1.0, 1.0)
+    }
+
+    /// What each number of the correction may be where the typical pose moves the ground by a metre.
+    pub(super) fn prior_scale(&self) -> Vector6<f64> {
+        self.correction_scale() * self.quality
     }
 
     pub(super) fn correct(&mut self, step: &Vector6<f64>) {

@@ -28,7 +28,7 @@ impl Plant {
     fn new(simulation: Simulation) -> Self {
         let layouts: Vec<Layout> =
             simulation.detections.iter().map(|d| layout::infer(d, None, &LayoutOptions::default())).collect();
-        let mut plant = Self { simulation, layouts, fused: Fused { lines: vec![], benches: vec![], doubts: vec![] } };
+        let mut plant = Self { simulation, layouts, fused: Fused::default() };
         let cloud = plant.simulation.reconstruction.dense.clone().unwrap_or_else(|| plant.sparse_cloud());
         let views = plant.views();
         let located = fusion::locate::locate(&views, &cloud);
@@ -139,7 +139,8 @@ fn the_order_of_the_views_does_not_matter() {
     for seed in 0..4 {
         let plant = Plant::random(seed, &Errors::paper());
         let expected = centers(&plant.refine(Method::Lattice));
-        let mut fused = Fused { lines: vec![], benches: plant.fused.benches.clone(), doubts: vec![] };
+        let mut fused = plant.fused.clone();
+        fused.camera_sigma_m.reverse();
         let views: Vec<View<'_>> = plant.views().into_iter().rev().collect();
         for o in fused.benches.iter_mut().flat_map(|b| &mut b.modules).flat_map(|m| &mut m.observations) {
             o.view = views.len() - 1 - o.view;
@@ -161,7 +162,7 @@ fn the_plant_moves_with_the_world() {
             shot.pose.camera_from_world *= rotation.inverse();
             shot.pose.translation_m = -(shot.pose.camera_from_world * center);
         }
-        let mut fused = Fused { lines: vec![], benches: plant.fused.benches.clone(), doubts: vec![] };
+        let mut fused = plant.fused.clone();
         for bench in &mut fused.benches {
             bench.pitch_m = bench.pitch_m.map(|pitch| (rotation * pitch.push(0.0)).xy());
             bench.middle_m = motion.apply(&bench.middle_m);

@@ -1,10 +1,12 @@
 //! Layout, fusion and refinement on simulated plants: what comes out must be the plant that went in.
 
 mod contract;
+mod geometry;
 
 use heliomap_mapping::assembly::{Identity, assemble};
 use heliomap_mapping::detection::ImageDetections;
 use heliomap_mapping::fusion::{self, Fused, FusionOptions, View};
+use heliomap_mapping::geometry::PointCloud;
 use heliomap_mapping::layout::{self, Layout, LayoutOptions};
 use heliomap_mapping::refinement::{self, Refined, RefinementOptions};
 use heliomap_model::{ModuleId, ModuleStatus, PlantId, PlantModel};
@@ -42,12 +44,20 @@ fn views<'a>(simulation: &'a Simulation, layouts: &'a [Layout]) -> Vec<View<'a>>
 
 impl Mapped {
     fn new(simulation: Simulation) -> Self {
+        let sparse = || PointCloud {
+            positions_m: simulation.reconstruction.sparse_points_m.iter().map(|p| p.cast::<f32>().into()).collect(),
+            normals: Vec::new(),
+        };
+        let cloud = simulation.reconstruction.dense.clone().unwrap_or_else(sparse);
+        Self::with_cloud(simulation, &cloud)
+    }
+
+    fn with_cloud(simulation: Simulation, cloud: &PointCloud) -> Self {
         let layouts = lay_out(&simulation.detections);
         let views = views(&simulation, &layouts);
-        let cloud = simulation.reconstruction.dense.clone().unwrap();
-        let located = fusion::locate::locate(&views, &cloud);
-        let fused = fusion::fuse(&views, located, &FusionOptions::default());
-        let refined = refinement::refine(&views, &fused, &RefinementOptions::default());
+        let located = fusion::locate::locate(&views, cloud);
+        let mut fused = fusion::fuse(&views, located, &FusionOptions::default());
+        let refined = refinement::refine_verified(&views, &mut fused, &RefinementOptions::default());
         Self { simulation, layouts, fused, refined }
     }
 
