@@ -213,7 +213,7 @@ impl PieceLattice {
     }
 
     /// The same for a piece that begins at another column of this one.
-    pub(super) fn from_column(&self, col: i32) -> Self {
+    pub(super) fn starting_at(&self, col: i32) -> Self {
         let mut moved = self.clone();
         moved.origin[0] -= f64::from(col);
         moved

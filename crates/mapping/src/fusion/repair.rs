@@ -172,7 +172,7 @@ fn part(piece: &LocatedPiece, from: i32, to: i32) -> Option<(LocatedPiece, i32)>
     }
     part.cols = high - low + 1;
     part.bridges = piece.bridges.iter().map(|b| b - low).filter(|b| (0..part.cols - 1).contains(b)).collect();
-    part.lattice = piece.lattice.as_ref().map(|lattice| Box::new(lattice.from_column(low)));
+    part.lattice = piece.lattice.as_ref().map(|lattice| Box::new(lattice.starting_at(low)));
     part.refit(piece.pitch_m());
     Some((part, low))
 }

@@ -14,6 +14,9 @@ use std::collections::BTreeMap;
 /// Columns and rows.
 type Shift = (i32, i32);
 
+/// A sighting: the index of its module in the bench, and its own among the module's observations.
+type Sighting = (usize, usize);
+
 /// Where a sighting belongs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Verdict {
@@ -48,18 +51,18 @@ pub fn refine_verified(views: &[View<'_>], fused: &mut Fused, options: &Refineme
     refined
 }
 
-/// Sightings (module, place among its observations) that do not belong where they are.
+/// Sightings that do not belong where they are.
 fn verdicts(
     views: &[View<'_>],
     bench: &FusedBench,
     refined: &Refined,
     index: usize,
     options: &RefinementOptions,
-) -> BTreeMap<(usize, usize), Verdict> {
+) -> BTreeMap<Sighting, Verdict> {
     let params = &options.params;
     let lattice = &refined.benches[index];
     let pitch = pitches(bench, refined, index);
-    let mut off: BTreeMap<usize, Vec<((usize, usize), Vector2<f64>)>> = BTreeMap::new();
+    let mut off: BTreeMap<usize, Vec<(Sighting, Vector2<f64>)>> = BTreeMap::new();
     for (m, (module, place)) in bench.modules.iter().zip(&lattice.modules).enumerate() {
         for (k, seen) in module.observations.iter().enumerate() {
             let (camera, pose) = (&views[seen.view].shot.camera, &refined.poses[seen.view]);
@@ -75,7 +78,7 @@ fn verdicts(
     }
     let mut verdicts = BTreeMap::new();
     for sightings in off.values() {
-        let mut by_shift: BTreeMap<Shift, Vec<((usize, usize), f64)>> = BTreeMap::new();
+        let mut by_shift: BTreeMap<Shift, Vec<(Sighting, f64)>> = BTreeMap::new();
         for (sighting, steps) in sightings {
             let whole = steps.map(f64::round);
             by_shift.entry((whole.x as i32, whole.y as i32)).or_default().push((*sighting, (steps - whole).amax()));
@@ -114,7 +117,7 @@ fn pitches(bench: &FusedBench, refined: &Refined, index: usize) -> [f64; 2] {
 }
 
 /// Moves sightings to the modules that they show. Returns how many did not stay.
-pub(super) fn replace(bench: &mut FusedBench, verdicts: &BTreeMap<(usize, usize), Verdict>) -> usize {
+pub(super) fn replace(bench: &mut FusedBench, verdicts: &BTreeMap<Sighting, Verdict>) -> usize {
     let mut places: BTreeMap<(i32, i32), FusedModule> = BTreeMap::new();
     let mut moved: Vec<((i32, i32), Observation)> = Vec::new();
     for (m, module) in bench.modules.iter().enumerate() {
