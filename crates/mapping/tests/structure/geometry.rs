@@ -71,6 +71,9 @@ fn points_on_the_ground_or_below_it_change_nothing() {
     }
 }
 
+/// Whether a bench is matched wrongly in a view, by their indices.
+type Sabotage<'a> = Box<dyn Fn(usize, usize) -> bool + 'a>;
+
 /// Moves what some views show of a bench by a column, as a wrong match does.
 fn move_by_a_column(mapped: &mut Mapped, bench: usize, moved: impl Fn(usize) -> bool) {
     let bench = &mut mapped.fused.benches[bench];
@@ -102,7 +105,7 @@ fn wrong_matches_are_put_right_after_the_adjustment() {
         (0..sound.fused.benches.len()).filter(|bench| seen_in(*bench).len() >= 5).take(4).collect();
     assert!(benches.len() >= 2);
     let whole_view = seen_in(benches[0])[1];
-    let sabotages: Vec<(&str, Box<dyn Fn(usize, usize) -> bool>)> = vec![
+    let sabotages: Vec<(&str, Sabotage<'_>)> = vec![
         ("one view on one bench", Box::new(|bench, view| bench == benches[0] && view == whole_view)),
         ("one view", Box::new(|_, view| view == whole_view)),
         (
