@@ -153,8 +153,9 @@ def make(args: argparse.Namespace, out: Path, database: str | None) -> dict:
     for of in (interrupted, queued):
         upload(service, uploads, of, {path: content for path, content in args.files.items() if path != "boxes.json"})
     half = job(interrupted)
-    while not ((state(half).get("progress") or {}).get("stage") == "detect"
-               and state(half)["progress"]["done"] >= CHECKPOINTS):
+    while not (
+        (state(half).get("progress") or {}).get("stage") == "detect" and state(half)["progress"]["done"] >= CHECKPOINTS
+    ):
         time.sleep(0.05)
     # Checkpoints are stored about every second.
     time.sleep(2)
@@ -162,10 +163,22 @@ def make(args: argparse.Namespace, out: Path, database: str | None) -> dict:
     service = Service(args, storage, ["--no-worker", "--webhook-private-targets"], log)
     waiting = job(queued)
     answers = {}
-    for path in ["/plants", f"/plants/{plant}", f"/plants/{plant}/surveys", mapped, f"{mapped}/images",
-                 f"/plants/{plant}/jobs", f"/plants/{plant}/models", f"/plants/{plant}/models/1/modules?limit=3",
-                 f"/plants/{plant}/models/1/benches?limit=3", "/webhooks",
-                 f"/webhooks/{webhook['id']}/deliveries", "/keys", "/audit?limit=200", "/usage"]:
+    for path in [
+        "/plants",
+        f"/plants/{plant}",
+        f"/plants/{plant}/surveys",
+        mapped,
+        f"{mapped}/images",
+        f"/plants/{plant}/jobs",
+        f"/plants/{plant}/models",
+        f"/plants/{plant}/models/1/modules?limit=3",
+        f"/plants/{plant}/models/1/benches?limit=3",
+        "/webhooks",
+        f"/webhooks/{webhook['id']}/deliveries",
+        "/keys",
+        "/audit?limit=200",
+        "/usage",
+    ]:
         try:
             answers[path] = service.call(admin, "GET", path)
         except SystemExit as problem:
@@ -228,9 +241,11 @@ def main() -> None:
     expected = {"sqlite": make(args, args.out / "sqlite", None)}
     folder = args.out / "sqlite" / "data"
     rows = sqlite3.connect(folder / "heliomap.db")
-    count_checkpoints(rows.execute("SELECT image FROM checkpoints").fetchall()
-                      if "image" in [c[1] for c in rows.execute("PRAGMA table_info(checkpoints)")]
-                      else rows.execute("SELECT name FROM checkpoints").fetchall())
+    count_checkpoints(
+        rows.execute("SELECT image FROM checkpoints").fetchall()
+        if "image" in [c[1] for c in rows.execute("PRAGMA table_info(checkpoints)")]
+        else rows.execute("SELECT name FROM checkpoints").fetchall()
+    )
     rows.close()
     subprocess.run([args.binary, "backup", "--data-dir", folder, args.out / "sqlite" / "backup"], check=True)
 
@@ -239,8 +254,11 @@ def main() -> None:
     subprocess.run([programs / "createdb", f"--maintenance-db={server}/postgres", "fixture"], check=True)
     database = f"{server}/fixture"
     expected["postgres"] = make(args, args.out / "postgres", database)
-    dump = subprocess.run([programs / "pg_dump", "--format=plain", "--no-owner", "--no-privileges", database],
-                          check=True, stdout=subprocess.PIPE).stdout
+    dump = subprocess.run(
+        [programs / "pg_dump", "--format=plain", "--no-owner", "--no-privileges", database],
+        check=True,
+        stdout=subprocess.PIPE,
+    ).stdout
     (args.out / "postgres" / "dump.sql").write_bytes(dump)
     lines = dump.decode().split("COPY public.checkpoints", 1)[1].split("\\.", 1)[0].splitlines()[1:]
     count_checkpoints(lines)
