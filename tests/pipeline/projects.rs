@@ -41,10 +41,8 @@ fn odm_project_folder_is_read_in_its_local_frame() {
     is_exact(&survey);
 }
 
-#[test]
-fn whole_utm_coordinates_are_brought_back_to_the_local_frame() {
-    let survey = Survey::new();
-    survey.remove(CLOUD);
+/// Puts the reconstruction into UTM less `offset_m`, as OpenSfM's `export_geocoords` does.
+fn write_in_utm(survey: &Survey, offset_m: [f64; 3]) {
     // The reference in EPSG:32633, and how its east axis is turned and scaled there, from PROJ 9.
     let (origin, turn_rad, scale) = ([428_983.25, 5_519_254.303_5], -0.013_166_f64, 0.999_661_9);
     let reference: Value = serde_json::from_slice(&survey.read("reference_lla.json")).unwrap();
@@ -53,7 +51,8 @@ fn whole_utm_coordinates_are_brought_back_to_the_local_frame() {
         let turn = nalgebra::Rotation3::from_axis_angle(&nalgebra::Vector3::z_axis(), turn_rad);
         let to_utm = |local: nalgebra::Vector3<f64>| {
             let turned = turn * local;
-            nalgebra::Vector3::new(origin[0] + scale * turned.x, origin[1] + scale * turned.y, local.z)
+            let utm = nalgebra::Vector3::new(origin[0] + scale * turned.x, origin[1] + scale * turned.y, local.z);
+            utm - nalgebra::Vector3::from(offset_m)
         };
         let vector = |value: &Value| nalgebra::Vector3::from_fn(|axis, _| value[axis].as_f64().unwrap());
         for shot in shots(reconstruction) {
@@ -67,6 +66,13 @@ fn whole_utm_coordinates_are_brought_back_to_the_local_frame() {
             point["coordinates"] = json!(to_utm(vector(&point["coordinates"])).as_slice());
         }
     });
+}
+
+#[test]
+fn whole_utm_coordinates_are_brought_back_to_the_local_frame() {
+    let survey = Survey::new();
+    survey.remove(CLOUD);
+    write_in_utm(&survey, [0.0; 3]);
     is_exact(&survey);
     survey.edit(|reconstruction| {
         for shot in shots(reconstruction) {
@@ -74,6 +80,34 @@ fn whole_utm_coordinates_are_brought_back_to_the_local_frame() {
         }
     });
     is_refused(&survey, &["reconstruction.json", "local frame", "topocentric"]);
+}
+
+#[test]
+fn utm_less_an_offset_that_no_file_states_is_not_mapped_turned() {
+    let survey = Survey::new();
+    survey.remove(CLOUD);
+    let plain = survey.map(true, &[]);
+    assert_eq!(plain.code, Some(0), "{}", plain.stderr);
+    let expected = module_places(&survey);
+    write_in_utm(&survey, [428_983.0, 5_519_254.0, -400.0]);
+    is_exact(&survey);
+    let found = module_places(&survey);
+    assert_eq!(found.len(), expected.len());
+    for (label, place) in &expected {
+        let metres = [(found[label][0] - place[0]) * 71_800.0, (found[label][1] - place[1]) * 111_200.0];
+        assert!(metres[0].hypot(metres[1]) < 0.02, "{label} is off by {metres:?} m");
+    }
+}
+
+/// Longitude and latitude of the first corner of each mapped module, degrees, by label.
+fn module_places(survey: &Survey) -> std::collections::BTreeMap<String, [f64; 2]> {
+    let plant: Value = serde_json::from_slice(&std::fs::read(survey.path("../out/plant.geojson")).unwrap()).unwrap();
+    let modules = plant["features"].as_array().unwrap().iter().map(|feature| {
+        let corner = &feature["geometry"]["coordinates"][0][0];
+        let label = feature["properties"]["label"].as_str().unwrap().to_owned();
+        (label, [0, 1].map(|axis| corner[axis].as_f64().unwrap()))
+    });
+    modules.collect()
 }
 
 #[test]

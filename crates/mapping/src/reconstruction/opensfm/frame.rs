@@ -1,5 +1,6 @@
 //! The frame of a reconstruction: OpenSfM's own is local, east-north-up about the reference; ODM rewrites it to UTM.
 
+use super::gnss;
 use super::json::Component;
 use crate::geometry::Pose;
 use crate::reconstruction::ReconstructionError;
@@ -15,6 +16,10 @@ const MAX_LOCAL_M: f64 = 100_000.0;
 const MAX_FROM_REFERENCE_M: f64 = 50_000.0;
 /// Step by which the frame's axes are measured, metres.
 const STEP_M: f64 = 100.0;
+/// A convergence below this is not looked for, radians (0.02 degrees): it moves a plant of 500 m by less than 0.1 m.
+const MIN_CONVERGENCE_RAD: f64 = 3.5e-4;
+/// Fewest shots with GNSS that show a turn.
+const MIN_GNSS_SHOTS: usize = 4;
 
 /// From the world of the file to the local east-north-up frame.
 pub(super) enum Frame {
@@ -27,7 +32,8 @@ pub(super) enum Frame {
 pub(super) struct Projected {
     projection: Proj,
     geographic: Proj,
-    offset_m: [f64; 2],
+    /// What was taken off easting, northing and height.
+    offset_m: Vector3<f64>,
     reference: GeodeticReference,
     /// Rotation of the local frame against the world's axes (the grid's convergence), at the origin of the world.
     local_from_world: Rotation3<f64>,
@@ -48,6 +54,7 @@ impl Frame {
         if let Some(folder) = georeferencing
             && let Some((definition, offset_m)) = coords(&folder.join("coords.txt"))
         {
+            let offset_m = Vector3::new(offset_m[0], offset_m[1], 0.0);
             return Ok(Self::Projected(Box::new(Projected::new(path, &definition, offset_m, reference)?)));
         }
         let centers: Vec<Vector3<f64>> = components
@@ -57,9 +64,10 @@ impl Frame {
             .collect();
         let mean = centers.iter().sum::<Vector3<f64>>() / centers.len().max(1) as f64;
         if mean.xy().norm() <= MAX_LOCAL_M {
-            return Ok(Self::Local);
+            let shifted = Projected::with_unknown_offset(path, components, reference)?;
+            return Ok(shifted.map_or(Self::Local, |projected| Self::Projected(Box::new(projected))));
         }
-        let projected = Projected::new(path, &utm_of(reference), [0.0; 2], reference)?;
+        let projected = Projected::new(path, &utm_of(reference), Vector3::zeros(), reference)?;
         let from_reference_m = projected.enu_m(mean).map_or(f64::INFINITY, |enu_m| enu_m.xy().norm());
         if from_reference_m > MAX_FROM_REFERENCE_M {
             return Err(ReconstructionError::NotLocal { path: path.to_owned(), east_m: mean.x, north_m: mean.y });
@@ -92,7 +100,7 @@ impl Projected {
     fn new(
         path: &Path,
         definition: &str,
-        offset_m: [f64; 2],
+        offset_m: Vector3<f64>,
         reference: GeodeticReference,
     ) -> Result<Self, ReconstructionError> {
         let parsed = |text: &str| {
@@ -111,7 +119,7 @@ impl Projected {
             reference,
             local_from_world: Rotation3::identity(),
         };
-        let origin = frame.world_at(reference);
+        let origin = frame.world_at(reference.origin);
         let axis =
             |direction: Vector3<f64>| Some((frame.enu_m(origin + direction * STEP_M)? - frame.enu_m(origin)?) / STEP_M);
         let axes = [axis(Vector3::x()), axis(Vector3::y()), axis(Vector3::z())];
@@ -126,24 +134,74 @@ impl Projected {
         Ok(frame)
     }
 
-    /// The reference in the world, metres.
-    fn world_at(&self, reference: GeodeticReference) -> Vector3<f64> {
-        let origin = reference.origin;
-        let mut point = (origin.longitude_deg.to_radians(), origin.latitude_deg.to_radians(), 0.0);
+    /// UTM less an offset that no file states, as OpenSfM's `export_geocoords` leaves it; `None` where the world is local.
+    /// OpenSfM aligns a local world with GNSS, so its cameras are not turned against their GNSS positions. In UTM they are
+    /// turned by the grid's convergence. The offset follows from the GNSS positions.
+    fn with_unknown_offset(
+        path: &Path,
+        components: &[Component],
+        reference: GeodeticReference,
+    ) -> Result<Option<Self>, ReconstructionError> {
+        let shots = components.iter().flat_map(|component| component.shots.values());
+        let pairs: Vec<(Vector3<f64>, Vector3<f64>)> = shots
+            .filter_map(|shot| {
+                let center = Pose::from_axis_angle(shot.rotation.into(), shot.translation.into()).center();
+                Some((center, gnss(shot)?)).filter(|_| center.iter().all(|value| value.is_finite()))
+            })
+            .collect();
+        if pairs.len() < MIN_GNSS_SHOTS {
+            return Ok(None);
+        }
+        let mut frame = Self::new(path, &utm_of(reference), Vector3::zeros(), reference)?;
+        let east = frame.local_from_world * Vector3::x();
+        let convergence_rad = east.y.atan2(east.x);
+        let (world, gnss_enu_m) = means(&pairs);
+        let turn_rad = turn(&pairs, world, gnss_enu_m);
+        if convergence_rad.abs() < MIN_CONVERGENCE_RAD || (turn_rad - convergence_rad).abs() > turn_rad.abs() / 3.0 {
+            return Ok(None);
+        }
+        frame.offset_m = frame.world_at(reference.lla_from_enu(gnss_enu_m)) - world;
+        Ok(Some(frame))
+    }
+
+    /// A place in the world, metres.
+    fn world_at(&self, place: Lla) -> Vector3<f64> {
+        let mut point = (place.longitude_deg.to_radians(), place.latitude_deg.to_radians(), 0.0);
         match transform(&self.geographic, &self.projection, &mut point) {
-            Ok(()) => Vector3::new(point.0 - self.offset_m[0], point.1 - self.offset_m[1], origin.height_m),
+            Ok(()) => Vector3::new(point.0, point.1, place.height_m) - self.offset_m,
             Err(_) => Vector3::zeros(),
         }
     }
 
     fn enu_m(&self, world_m: Vector3<f64>) -> Option<Vector3<f64>> {
-        let mut point = (world_m.x + self.offset_m[0], world_m.y + self.offset_m[1], 0.0);
+        let projected_m = world_m + self.offset_m;
+        let mut point = (projected_m.x, projected_m.y, 0.0);
         transform(&self.projection, &self.geographic, &mut point).ok()?;
         let position =
-            Lla { longitude_deg: point.0.to_degrees(), latitude_deg: point.1.to_degrees(), height_m: world_m.z };
+            Lla { longitude_deg: point.0.to_degrees(), latitude_deg: point.1.to_degrees(), height_m: projected_m.z };
         let enu_m = self.reference.enu_from_lla(position);
         enu_m.iter().all(|value| value.is_finite()).then_some(enu_m)
     }
+}
+
+/// Means of both sides of `pairs`, metres.
+fn means(pairs: &[(Vector3<f64>, Vector3<f64>)]) -> (Vector3<f64>, Vector3<f64>) {
+    let sum =
+        |sums: (Vector3<f64>, Vector3<f64>), pair: &(Vector3<f64>, Vector3<f64>)| (sums.0 + pair.0, sums.1 + pair.1);
+    let (first, second) = pairs.iter().fold((Vector3::zeros(), Vector3::zeros()), sum);
+    let count = pairs.len().max(1) as f64;
+    (first / count, second / count)
+}
+
+/// The angle about the vertical that turns the first points of `pairs` onto the second by least squares, radians.
+fn turn(pairs: &[(Vector3<f64>, Vector3<f64>)], first_mean: Vector3<f64>, second_mean: Vector3<f64>) -> f64 {
+    let (mut sine, mut cosine) = (0.0, 0.0);
+    for (first, second) in pairs {
+        let (first, second) = (first - first_mean, second - second_mean);
+        cosine += first.x * second.x + first.y * second.y;
+        sine += first.x * second.y - first.y * second.x;
+    }
+    sine.atan2(cosine)
 }
 
 /// The projection and offset of ODM's `coords.txt`: `WGS84 UTM 33N`, then the offset east and north, metres.
@@ -181,9 +239,14 @@ mod tests {
     fn utm_is_undone_to_a_millimetre_and_a_microradian() {
         // PROJ 9 gives (428979.8554, 5519085.3154) for longitude 14.0127, latitude 49.82 in EPSG:32633.
         let reference = GeodeticReference::new(Lla { latitude_deg: 49.82, longitude_deg: 14.0127, height_m: 0.0 });
-        let frame =
-            Projected::new(Path::new("r.json"), &utm_of(reference), [428_000.0, 5_518_000.0], reference).unwrap();
-        let origin = frame.world_at(reference);
+        let frame = Projected::new(
+            Path::new("r.json"),
+            &utm_of(reference),
+            Vector3::new(428_000.0, 5_518_000.0, 0.0),
+            reference,
+        )
+        .unwrap();
+        let origin = frame.world_at(reference.origin);
         assert!((origin - Vector3::new(979.8554, 1085.3154, 0.0)).norm() < 1e-3, "{origin}");
         assert!(frame.enu_m(origin).unwrap().norm() < 1e-3);
         // East of the grid is turned by the convergence, (longitude - 15) * sin(latitude), against east.
