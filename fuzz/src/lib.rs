@@ -1,4 +1,6 @@
-//! What the fuzz targets share: files in memory, and the service in this process.
+//! What the fuzz targets share: files in memory, what an input may cost, and the service in this process.
+
+pub mod memory;
 
 use axum::Router;
 use axum::body::{Body, to_bytes};

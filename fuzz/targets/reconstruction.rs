@@ -2,12 +2,16 @@
 
 #![no_main]
 
+use heliomap_fuzz::memory::Allowance;
 use heliomap_mapping::reconstruction::opensfm;
 use libfuzzer_sys::fuzz_target;
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
 const FILES: [&str; 3] = ["reconstruction.json", "reference_lla.json", "undistorted/reconstruction.json"];
+
+/// The survey's other files, and a document of which every few bytes may be a value of its own.
+const PROJECT: Allowance = Allowance { bytes: 8 << 20, per_input_byte: 256 };
 
 /// The corpus' own survey of two small photos, whole.
 static SURVEY: LazyLock<PathBuf> = LazyLock::new(|| {
@@ -29,7 +33,7 @@ fuzz_target!(|bytes: &[u8]| {
     let path = SURVEY.join(FILES[usize::from(*which) % FILES.len()]);
     let before = std::fs::read(&path).ok();
     std::fs::write(&path, document).unwrap();
-    if let Ok(project) = opensfm::read(&*SURVEY, 1_000_000) {
+    if let Ok(project) = PROJECT.within(bytes.len(), "a reconstruction", || opensfm::read(&*SURVEY, 1_000_000)) {
         assert_eq!(project.photos.len(), project.reconstruction.shots.len());
         for shot in &project.reconstruction.shots {
             assert!(shot.camera.focal_px().is_finite() && shot.camera.focal_px() > 0.0);

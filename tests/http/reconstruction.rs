@@ -259,3 +259,98 @@ async fn a_reconstruction_of_more_images_than_any_survey_has_is_refused() {
     assert_eq!(told["images"]["not_uploaded_count"], 60_000);
     assert_eq!(told["images"]["not_uploaded"].as_array().unwrap().len(), 1000);
 }
+
+/// An archive that came changed, cut or with more than itself, by what was done to it.
+fn spoilt() -> Vec<(&'static str, Vec<u8>)> {
+    let file = tar::EntryType::Regular;
+    let whole = tar(&[("reference_lla.json", file, REFERENCE), ("notes.txt", file, b"nothing")]);
+    let other = tar(&[("reconstruction.json", file, RECONSTRUCTION)]);
+    // Not compressed, so that a byte of the file can be changed.
+    let mut stored = GzEncoder::new(Vec::new(), Compression::none());
+    stored.write_all(&whole).unwrap();
+    let stored = stored.finish().unwrap();
+    let changed = |archive: &[u8], content: &[u8], to: u8| {
+        let at = archive.windows(content.len()).position(|window| window == content).unwrap();
+        let mut archive = archive.to_vec();
+        archive[at] = to;
+        archive
+    };
+    let packed = gzip(&whole);
+    let mut plain = zip::ZipWriter::new(Cursor::new(Vec::new()));
+    for (name, bytes) in [("reference_lla.json", REFERENCE), ("notes.txt", b"nothing")] {
+        let options = SimpleFileOptions::default().compression_method(zip::CompressionMethod::Stored);
+        plain.start_file(name, options).unwrap();
+        plain.write_all(bytes).unwrap();
+    }
+    let plain = plain.finish().unwrap().into_inner();
+    let entries = whole.len() - 1024;
+    vec![
+        ("a digit of a tar.gz", changed(&stored, b"50.0", b'1')),
+        ("a byte of an entry that is ignored", changed(&stored, b"nothing", b'N')),
+        ("a tar.gz without its trailer", packed[..packed.len() - 8].to_vec()),
+        ("a tar.gz without the end of its trailer", packed[..packed.len() - 2].to_vec()),
+        ("a tar.gz and a byte", [&packed[..], b"x"].concat()),
+        ("two tar.gz", [packed.clone(), gzip(&other)].concat()),
+        ("two tars", [whole.clone(), other.clone()].concat()),
+        ("a tar cut between two entries", whole[..entries].to_vec()),
+        ("a gzipped tar cut between two entries", gzip(&whole[..entries])),
+        ("a tar and a byte", [&whole[..], b"x"].concat()),
+        ("a digit of a zip", changed(&plain, b"50.0", b'1')),
+        ("a byte of a zip's entry that is ignored", changed(&plain, b"nothing", b'N')),
+        ("a zip and a byte", [&plain[..], b"x"].concat()),
+        ("two zips", [plain.clone(), zip(&[("reconstruction.json", RECONSTRUCTION)])].concat()),
+        ("a zip without its last byte", plain[..plain.len() - 1].to_vec()),
+    ]
+}
+
+#[tokio::test]
+async fn an_archive_that_came_changed_is_refused_and_nothing_of_it_is_stored() {
+    let app = App::new(&[]).await;
+    let survey = app.survey().await;
+    for (what, archive) in spoilt() {
+        let (status, problem) = app.put(&format!("{survey}/reconstruction"), archive).await;
+        assert_eq!((status.as_u16(), &problem["code"]), (422, &json!("archive_unreadable")), "{what}: {problem}");
+        assert_eq!(app.get(&survey).await.1["files"], json!([]), "{what}");
+    }
+    assert_eq!(std::fs::read_dir(app.folder.path().join("incoming")).unwrap().count(), 0);
+}
+
+#[tokio::test]
+async fn archives_of_other_kinds_are_refused_by_their_names() {
+    let app = App::new(&[]).await;
+    let survey = app.survey().await;
+    let begins: [(&[u8], &str); 5] = [
+        (b"\xfd7zXZ\0\0\x04", "xz"),
+        (b"BZh91AY&SY", "bzip2"),
+        (b"\x28\xb5\x2f\xfd\x04", "Zstandard"),
+        (b"7z\xbc\xaf\x27\x1c\0\x04", "7z"),
+        (b"Rar!\x1a\x07\x01\0", "RAR"),
+    ];
+    for (begin, kind) in begins {
+        let answer = app.put(&format!("{survey}/reconstruction"), [begin, &[7; 600]].concat()).await;
+        assert_problem(answer, 415, "unsupported_archive", kind);
+    }
+}
+
+#[tokio::test]
+async fn an_archive_may_be_in_pieces_that_are_one() {
+    let app = App::new(&[]).await;
+    let survey = app.survey().await;
+    let file = tar::EntryType::Regular;
+    let whole = tar(&[("reference_lla.json", file, REFERENCE), ("reconstruction.json", file, RECONSTRUCTION)]);
+    let (front, back) = whole.split_at(700);
+    let mut commented = zip::ZipWriter::new(Cursor::new(Vec::new()));
+    commented.set_comment("made by a person").unwrap();
+    commented.start_file("reference_lla.json", SimpleFileOptions::default()).unwrap();
+    commented.write_all(REFERENCE).unwrap();
+    for archive in [
+        // Several members of gzip are one stream (RFC 1952, 2.2).
+        [gzip(front), gzip(back)].concat(),
+        // Records of tar are filled up with zeros.
+        [&whole[..], &[0; 8192]].concat(),
+        commented.finish().unwrap().into_inner(),
+    ] {
+        let (status, answer) = app.put(&format!("{survey}/reconstruction"), archive).await;
+        assert_eq!(status, StatusCode::OK, "{answer}");
+    }
+}

@@ -416,7 +416,7 @@ async fn unpack(state: &AppState, archive: StagedFile) -> Result<Unpacked, ApiEr
     let unpacked = work.await.map_err(|error| ApiError::internal(&error))?;
     unpacked.map_err(|error| {
         let code = match &error {
-            ArchiveError::Unknown => Code::UnsupportedArchive,
+            ArchiveError::Unknown | ArchiveError::OtherKind { .. } => Code::UnsupportedArchive,
             ArchiveError::Unreadable(_) => Code::ArchiveUnreadable,
             ArchiveError::Unsafe { .. } | ArchiveError::Twice { .. } => Code::ArchiveUnsafe,
             ArchiveError::TooLarge { .. } => Code::ArchiveTooLarge,

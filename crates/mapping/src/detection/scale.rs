@@ -3,11 +3,11 @@
 
 use super::{DetectionError, Detector};
 use crate::geometry::Quad;
-use exif::{In, Reader, Tag};
+use crate::reconstruction::exif;
 use image::RgbImage;
 use nalgebra::Vector2;
 use std::fs::File;
-use std::io::{BufReader, Read};
+use std::io::Read;
 use std::path::Path;
 
 /// The short side of a module, metres: framed ones have 0.99 to 1.13, thin-film ones 0.6.
@@ -30,13 +30,7 @@ pub fn from_metadata(path: &Path, width: u32, height: u32) -> Option<f64> {
     let mut start = Vec::new();
     File::open(path).ok()?.take(METADATA_BYTES).read_to_end(&mut start).ok()?;
     let height_m = relative_altitude_m(&start)?;
-    // What can be read counts, where a directory is not to the letter.
-    let exif = Reader::new()
-        .continue_on_error(true)
-        .read_from_container(&mut BufReader::new(File::open(path).ok()?))
-        .or_else(|error| error.distill_partial_result(|_| {}))
-        .ok()?;
-    let focal_mm = f64::from(exif.get_field(Tag::FocalLengthIn35mmFilm, In::PRIMARY)?.value.get_uint(0)?);
+    let focal_mm = exif::film_focal_mm(path)?;
     let focal_px = focal_mm / FILM_DIAGONAL_MM * f64::from(width).hypot(f64::from(height));
     (HEIGHTS_M.contains(&height_m) && focal_px > 1.0).then(|| height_m / focal_px)
 }

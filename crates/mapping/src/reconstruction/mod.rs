@@ -1,6 +1,7 @@
 //! What structure from motion gives us, as one type, with one reader per producer.
 
 pub mod error;
+mod excerpt;
 pub mod exif;
 mod folder;
 mod jpeg;

@@ -1,6 +1,7 @@
 //! Photos: checked by their header before anything is decoded, decoded whole or refused, undistorted where the file is
 //! as the lens drew it.
 
+use super::excerpt::{Excerpt, Parts};
 use super::exif::{self, Exposure};
 use super::jpeg::{self, JpegError};
 use super::quality::{MEASURED_PX, Quality};
@@ -19,6 +20,8 @@ use std::path::{Path, PathBuf};
 
 /// Default for the most pixels that an image may have: 100 megapixels.
 pub const DEFAULT_MAX_PIXELS: u64 = 100_000_000;
+/// Most values of an entry of a TIFF's directory: 100 megapixels in tiles of 16 x 16 pixels have so many places.
+const MAX_TIFF_VALUES: u32 = 400_000;
 
 /// Why a photo is refused. Each sentence names the file and says what to do.
 #[derive(Debug, thiserror::Error)]
@@ -143,15 +146,8 @@ pub fn inspect(path: &Path, name: &str, max_pixels: u64) -> Result<PhotoHeader, 
     }
     let within = |size: [u32; 2]| u64::from(size[0]) * u64::from(size[1]) <= max_pixels;
     let size_px = match format {
-        ImageFormat::Jpeg => {
-            let reader = BufReader::with_capacity(1 << 18, file);
-            jpeg::walk(reader, within).map_err(|error| match error {
-                JpegError::CutShort => PhotoError::Truncated { name: name.to_owned() },
-                JpegError::Malformed(what) => not_an_image(what),
-                JpegError::Io(source) => unreadable(source),
-            })?
-        }
-        ImageFormat::Png => png_size(file, name)?,
+        ImageFormat::Jpeg => walk_jpeg(file, name, within)?.size_px,
+        ImageFormat::Png => walk_png(file, name)?.0,
         _ => tiff_size(file, name)?,
     };
     let [width_px, height_px] = size_px;
@@ -161,8 +157,21 @@ pub fn inspect(path: &Path, name: &str, max_pixels: u64) -> Result<PhotoHeader, 
     PhotoHeader { width_px, height_px, format }.within(name, max_pixels)
 }
 
-/// Walks a PNG's chunks to its end.
-fn png_size(mut file: File, name: &str) -> Result<[u32; 2], PhotoError> {
+fn walk_jpeg(file: impl Read, name: &str, limit: impl Fn([u32; 2]) -> bool) -> Result<jpeg::Structure, PhotoError> {
+    jpeg::walk(BufReader::with_capacity(1 << 18, file), limit).map_err(|error| match error {
+        JpegError::CutShort => PhotoError::Truncated { name: name.to_owned() },
+        JpegError::Io(source) => PhotoError::Unreadable { name: name.to_owned(), source },
+        JpegError::Malformed(_) | JpegError::TooManyParts => {
+            PhotoError::NotAnImage { name: name.to_owned(), what: error.to_string() }
+        }
+    })
+}
+
+/// Chunks of a PNG that make its picture (PNG specification, third edition, 11.2, and transparency).
+const PICTURE_CHUNKS: [&[u8]; 5] = [b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND"];
+
+/// Walks a PNG's chunks to its end: its size, and the bytes that make the picture.
+fn walk_png(mut file: impl Read + Seek, name: &str) -> Result<([u32; 2], Parts), PhotoError> {
     let cut = |error: std::io::Error| match error.kind() {
         std::io::ErrorKind::UnexpectedEof => PhotoError::Truncated { name: name.to_owned() },
         _ => PhotoError::Unreadable { name: name.to_owned(), source: error },
@@ -171,15 +180,23 @@ fn png_size(mut file: File, name: &str) -> Result<[u32; 2], PhotoError> {
     let length = file.seek(SeekFrom::End(0)).map_err(cut)?;
     file.seek(SeekFrom::Start(8)).map_err(cut)?;
     let mut reader = BufReader::new(file);
+    let mut picture = Parts::default();
+    let mut keep =
+        |from: u64, to: u64| picture.add(from..to).map_err(|_| not_an_image("its picture is in too many pieces"));
+    keep(0, 8)?;
     let mut at = 8;
     let mut size_px = None;
     loop {
         let mut head = [0; 8];
         reader.read_exact(&mut head).map_err(cut)?;
         let chunk = u64::from(u32::from_be_bytes([head[0], head[1], head[2], head[3]]));
+        let from = at;
         at += 8 + chunk + 4;
         if at > length {
             return Err(PhotoError::Truncated { name: name.to_owned() });
+        }
+        if PICTURE_CHUNKS.contains(&&head[4..]) {
+            keep(from, at)?;
         }
         match (&head[4..], size_px) {
             (b"IHDR", None) if chunk == 13 => {
@@ -190,13 +207,28 @@ fn png_size(mut file: File, name: &str) -> Result<[u32; 2], PhotoError> {
                 reader.seek_relative(5 + 4).map_err(cut)?;
             }
             (_, None) => return Err(not_an_image("its header is missing")),
-            (b"IEND", Some(size_px)) => return Ok(size_px),
+            (b"IEND", Some(size_px)) => return Ok((size_px, picture)),
             _ => reader.seek_relative(chunk as i64 + 4).map_err(cut)?,
         }
     }
 }
 
-fn tiff_size(file: File, name: &str) -> Result<[u32; 2], PhotoError> {
+/// Refuses a TIFF whose directory claims so many values that a decoder, which keeps each of them, would need far more
+/// memory than the picture.
+fn require_sane_tiff(file: &mut (impl Read + Seek), name: &str) -> Result<(), PhotoError> {
+    match exif::most_tiff_values(file) {
+        Some(most) if most <= MAX_TIFF_VALUES => Ok(()),
+        Some(_) => Err(PhotoError::NotAnImage {
+            name: name.to_owned(),
+            what: format!("its directory has an entry of more than {MAX_TIFF_VALUES} values"),
+        }),
+        None => Err(PhotoError::NotAnImage { name: name.to_owned(), what: "it has no directory".to_owned() }),
+    }
+}
+
+fn tiff_size(mut file: File, name: &str) -> Result<[u32; 2], PhotoError> {
+    require_sane_tiff(&mut file, name)?;
+    file.rewind().map_err(|source| PhotoError::Unreadable { name: name.to_owned(), source })?;
     let mut reader = ImageReader::new(BufReader::new(file));
     reader.set_format(ImageFormat::Tiff);
     let decoder = reader.into_decoder().map_err(|error| undecodable(name, error))?;
@@ -262,11 +294,27 @@ pub fn examine(path: &Path, name: &str, header: PhotoHeader) -> Result<PhotoFact
     Ok(PhotoFacts { exposure: exif::read(path), quality: Quality::measure(&picture) })
 }
 
+/// Decodes a photo. What is no part of the picture, metadata and what follows its end, does not come to the decoder.
 fn decode(path: &Path, name: &str, format: ImageFormat) -> Result<DynamicImage, PhotoError> {
     let unreadable = |source| PhotoError::Unreadable { name: name.to_owned(), source };
-    let mut reader = ImageReader::new(BufReader::new(File::open(path).map_err(unreadable)?));
-    reader.set_format(format);
-    reader.decode().map_err(|error| undecodable(name, error))
+    let mut file = File::open(path).map_err(unreadable)?;
+    let picture = match format {
+        ImageFormat::Jpeg => Some(walk_jpeg(&file, name, |_| true)?.picture),
+        ImageFormat::Png => Some(walk_png(&file, name)?.1),
+        _ => {
+            require_sane_tiff(&mut file, name)?;
+            None
+        }
+    };
+    file.rewind().map_err(unreadable)?;
+    let decoded = match picture {
+        Some(parts) => {
+            let excerpt = BufReader::with_capacity(1 << 16, Excerpt::new(file, parts));
+            ImageReader::with_format(excerpt, format).decode()
+        }
+        None => ImageReader::with_format(BufReader::new(file), format).decode(),
+    };
+    decoded.map_err(|error| undecodable(name, error))
 }
 
 /// A photo on disk that belongs to a shot.

@@ -17,10 +17,22 @@ const MAX_NAMED: usize = 20;
 const CHUNK: usize = 128 << 10;
 /// Longest name of an entry, bytes.
 const MAX_NAME: usize = 1024;
-/// Most bytes between the contents of two entries of a tar: headers, and records of long names.
+/// Most bytes between the contents of two entries of a tar (headers, and records of long names) and behind the last.
 const MAX_BETWEEN: u64 = 1 << 20;
+/// Bytes of a block of a tar: contents fill whole blocks, and at least one block of zeros is its end (POSIX pax).
+const TAR_BLOCK: u64 = 512;
+/// The record that ends a zip, less its comment, and where in it the comment's length is (APPNOTE.TXT 4.3.16).
+const ZIP_END: (&[u8], u64, usize) = (b"PK\x05\x06", 22, 20);
 /// Most bytes of a zip's directory per entry that it may have, and in any case.
 const DIRECTORY_BYTES: (u64, u64) = (256, 1 << 20);
+/// How archives begin that people make and that are not read.
+const OTHER_KINDS: [(&[u8], &str); 5] = [
+    (b"\xfd7zXZ\0", "an xz file"),
+    (b"BZh", "a bzip2 file"),
+    (b"\x28\xb5\x2f\xfd", "a Zstandard file"),
+    (b"7z\xbc\xaf\x27\x1c", "a 7z archive"),
+    (b"Rar!", "a RAR archive"),
+];
 /// How much is unpacked before the disk is looked at again.
 const LOOK_EVERY_BYTES: u64 = 16 << 20;
 
@@ -29,6 +41,8 @@ const LOOK_EVERY_BYTES: u64 = 16 << 20;
 pub enum ArchiveError {
     #[error("the body begins as neither a zip, a tar nor a gzipped tar")]
     Unknown,
+    #[error("the body is {kind}, which is not read; make a zip, a tar or a tar.gz of the same files")]
+    OtherKind { kind: &'static str },
     #[error("the archive cannot be read: {0}; make it again")]
     Unreadable(String),
     #[error("the entry `{entry}` {what}; make an archive of plain files with relative paths")]
@@ -80,6 +94,8 @@ pub fn unpack(archive: &Path, folder: &Path, limits: &Limits) -> Result<Unpacked
         match places.get(&index) {
             Some(place) => unpacked.files.push((place.clone(), disk.stage(content)?)),
             None => {
+                // What is ignored is read as well: its checksum may tell that the archive came changed.
+                io::copy(content, &mut io::sink()).map_err(read_error)?;
                 unpacked.ignored_count += 1;
                 if unpacked.ignored.len() < MAX_NAMED {
                     unpacked.ignored.push(name.to_owned());
@@ -154,20 +170,28 @@ impl Reader<'_> {
             [b'P', b'K', 3, 4, ..] | [b'P', b'K', 5, 6, ..] => self.each_of_zip(file, visit),
             [0x1f, 0x8b, ..] => self.each_of_tar(flate2::read::MultiGzDecoder::new(file), visit),
             head if head.get(257..262) == Some(b"ustar".as_slice()) => self.each_of_tar(file, visit),
-            _ => Err(ArchiveError::Unknown),
+            head => Err(match OTHER_KINDS.into_iter().find(|(begin, _)| head.starts_with(begin)) {
+                Some((_, kind)) => ArchiveError::OtherKind { kind },
+                None => ArchiveError::Unknown,
+            }),
         }
     }
 
     fn each_of_zip(&self, file: BufReader<File>, visit: Visit<'_>) -> Result<(), ArchiveError> {
         // The directory is held in memory: how much of it there may be is known before it is read.
         let (per_entry, least) = DIRECTORY_BYTES;
-        let room = Cell::new(Some(least + per_entry * self.max_entries as u64));
-        let opened = zip::ZipArchive::new(Metered { inner: file, room: &room });
-        if room.get() == Some(0) {
+        let meter = Meter::default();
+        meter.bound(least + per_entry * self.max_entries as u64);
+        let opened = zip::ZipArchive::new(Metered { inner: file, meter: &meter });
+        if meter.is_used_up() {
             return Err(self.too_many());
         }
-        room.set(None);
+        meter.lift();
         let mut archive = opened.map_err(zip_error)?;
+        if archive.offset() != 0 {
+            return Err(ArchiveError::Unreadable("bytes that belong to no entry stand before its first".to_owned()));
+        }
+        require_zip_end(self.file, archive.comment().len())?;
         if archive.len() > self.max_entries {
             return Err(self.too_many());
         }
@@ -202,36 +226,41 @@ impl Reader<'_> {
     fn each_of_tar(&self, file: impl Read, visit: Visit<'_>) -> Result<(), ArchiveError> {
         let mut left = self.budget;
         let mut bounded = Bounded { inner: file, left: &mut left, exceeded: false };
-        let between = Cell::new(Some(MAX_BETWEEN));
-        let mut archive = tar::Archive::new(Metered { inner: &mut bounded, room: &between });
+        let between = Meter::default();
+        between.bound(MAX_BETWEEN);
+        let mut archive = tar::Archive::new(Metered { inner: &mut bounded, meter: &between });
         let outcome = self.each_of_entries(&mut archive, &between, visit);
+        let outcome = outcome.and_then(|padding| end_of_tar(archive.into_inner(), padding));
         if bounded.exceeded {
             return Err(self.too_much());
         }
-        if between.get() == Some(0) {
+        if between.is_used_up() {
             return Err(ArchiveError::Unreadable("what stands before an entry is too long".to_owned()));
         }
         outcome
     }
 
-    /// Names are held in memory before they are known: `between` bounds what is read of anything but contents.
+    /// Names are held in memory before they are known: `between` bounds what is read of anything but contents. The bytes
+    /// that fill the last block of the last content.
     fn each_of_entries<R: Read>(
         &self,
         archive: &mut tar::Archive<R>,
-        between: &Cell<Option<u64>>,
+        between: &Meter,
         mut visit: Visit<'_>,
-    ) -> Result<(), ArchiveError> {
+    ) -> Result<u64, ArchiveError> {
+        let mut padding = 0;
         for (index, entry) in archive.entries().map_err(read_error)?.enumerate() {
             if index >= self.max_entries {
                 return Err(self.too_many());
             }
             let mut entry = entry.map_err(read_error)?;
-            between.set(None);
+            between.lift();
             self.look_at(&mut entry, &mut visit)?;
             io::copy(&mut entry, &mut io::sink()).map_err(read_error)?;
-            between.set(Some(MAX_BETWEEN));
+            padding = entry.size().next_multiple_of(TAR_BLOCK) - entry.size();
+            between.bound(MAX_BETWEEN);
         }
-        Ok(())
+        Ok(padding)
     }
 
     fn look_at<R: Read>(&self, entry: &mut tar::Entry<'_, R>, visit: &mut Visit<'_>) -> Result<(), ArchiveError> {
@@ -296,7 +325,39 @@ fn zip_error(error: zip::result::ZipError) -> ArchiveError {
 }
 
 fn read_error(error: io::Error) -> ArchiveError {
-    ArchiveError::Unreadable(error.to_string())
+    match error.kind() {
+        io::ErrorKind::UnexpectedEof => ArchiveError::Unreadable("it is cut short".to_owned()),
+        _ => ArchiveError::Unreadable(error.to_string()),
+    }
+}
+
+/// Reads what follows the last entry of a tar to the end of the stream, so that the checksum of what it is packed in is
+/// compared: after `padding` bytes, at least one block of zeros and nothing else.
+fn end_of_tar<R: Read>(mut archive: Metered<'_, R>, padding: u64) -> Result<(), ArchiveError> {
+    io::copy(&mut archive, &mut io::sink()).map_err(read_error)?;
+    if !archive.meter.is_blank.get() {
+        return Err(ArchiveError::Unreadable("bytes follow its end, as where two archives were joined".to_owned()));
+    }
+    if archive.meter.count.get() < padding + TAR_BLOCK {
+        return Err(ArchiveError::Unreadable("it is cut short".to_owned()));
+    }
+    Ok(())
+}
+
+/// Fails where a zip with a comment of so many bytes does not end with its last record.
+fn require_zip_end(file: &Path, comment_bytes: usize) -> Result<(), ArchiveError> {
+    let (signature, record_bytes, length_at) = ZIP_END;
+    let mut file = File::open(file).map_err(ArchiveError::Disk)?;
+    let from_end = record_bytes + comment_bytes as u64;
+    let mut record = Vec::new();
+    file.seek(SeekFrom::End(-(from_end as i64))).map_err(ArchiveError::Disk)?;
+    file.take(record_bytes).read_to_end(&mut record).map_err(ArchiveError::Disk)?;
+    let length =
+        record.get(length_at..length_at + 2).map(|bytes| usize::from(u16::from_le_bytes([bytes[0], bytes[1]])));
+    if !record.starts_with(signature) || length != Some(comment_bytes) {
+        return Err(ArchiveError::Unreadable("bytes follow its end, as where two archives were joined".to_owned()));
+    }
+    Ok(())
 }
 
 /// Where entries are unpacked.
@@ -339,21 +400,51 @@ impl Disk<'_> {
     }
 }
 
-/// A reader that gives no more than there is room for, where there is a bound; what is left then is zero.
+/// What came out of a reader since it was last bounded.
+#[derive(Default)]
+struct Meter {
+    /// How much more may come, where there is a bound.
+    room: Cell<Option<u64>>,
+    /// Bytes that came.
+    count: Cell<u64>,
+    /// Whether all of them are zero.
+    is_blank: Cell<bool>,
+}
+
+impl Meter {
+    fn bound(&self, bytes: u64) {
+        self.room.set(Some(bytes));
+        self.count.set(0);
+        self.is_blank.set(true);
+    }
+
+    fn lift(&self) {
+        self.room.set(None);
+    }
+
+    fn is_used_up(&self) -> bool {
+        self.room.get() == Some(0)
+    }
+}
+
+/// A reader that gives no more than its meter has room for.
 struct Metered<'a, R> {
     inner: R,
-    room: &'a Cell<Option<u64>>,
+    meter: &'a Meter,
 }
 
 impl<R: Read> Read for Metered<'_, R> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        let Some(room) = self.room.get() else { return self.inner.read(buffer) };
+        let meter = self.meter;
+        let Some(room) = meter.room.get() else { return self.inner.read(buffer) };
         let most = buffer.len().min(usize::try_from(room).unwrap_or(usize::MAX));
         if most == 0 && !buffer.is_empty() {
             return Err(io::Error::other("more than it may hold"));
         }
         let count = self.inner.read(&mut buffer[..most])?;
-        self.room.set(Some(room - count as u64));
+        meter.room.set(Some(room - count as u64));
+        meter.count.set(meter.count.get() + count as u64);
+        meter.is_blank.set(meter.is_blank.get() && buffer[..count].iter().all(|byte| *byte == 0));
         Ok(count)
     }
 }
