@@ -17,7 +17,7 @@ export ORT_DYLIB_PATH ?= $(abspath $(ORT_LIBRARY))
 HELIOMAP_DATA ?= $(abspath $(wildcard ../shared/data))
 export HELIOMAP_DATA
 
-.PHONY: help setup web demo test lint format deny unit page client kills tus contract query load scale-out tenants deploy-lint fuzz structure bench scaling yolo-export openapi configuration clean
+.PHONY: help setup web demo test lint format deny unit page client kills disk-full tus contract query load scale-out tenants deploy-lint fuzz structure bench scaling yolo-export openapi configuration clean
 
 help: ## List the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -99,6 +99,10 @@ kills: setup ## Kill server and worker at random KILLS times, half of them on Po
 	$(PYTHON) tests/kills/kills.py --binary target/debug/heliomap --kills $$(( $(KILLS) / 2 ))
 	tests/with-postgres.sh bash -c '$(PYTHON) tests/kills/kills.py --binary target/debug/heliomap \
 	  --kills $$(( $(KILLS) - $(KILLS) / 2 )) --seed 2 --database "$$HELIOMAP_TEST_POSTGRES/postgres"'
+
+disk-full: setup ## Fill the disk of a service (tmpfs, needs root) and make room again; all must work by itself afterwards
+	$(CARGO) test --locked --no-run
+	$(PYTHON) tests/disk/full.py --binary target/debug/heliomap
 
 tus: setup .venv/tus/done tests/tus/node_modules/done ## Upload 1 GB with two tus clients through 20 disconnects and a kill; compare the bytes
 	$(CARGO) build --locked

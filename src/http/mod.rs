@@ -11,9 +11,11 @@ mod middleware;
 mod paging;
 mod server;
 mod uploads;
+mod writable;
 
 pub use middleware::rates::Rates;
 pub use router::{openapi, router};
 pub use server::serve;
 pub use state::AppState;
 pub use uploads::tus::Desk;
+pub use writable::Writable;

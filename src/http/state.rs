@@ -4,6 +4,7 @@ use crate::config::{Limits, NetworkArgs};
 use crate::http::error::{ApiError, Code};
 use crate::http::middleware::rates::Rates;
 use crate::http::uploads::tus::Desk;
+use crate::http::writable::Writable;
 use crate::jobs::PipelineMapper;
 use crate::oidc::Oidc;
 use crate::store::{Blobs, Plant, Store, Survey, SurveyId};
@@ -27,6 +28,8 @@ pub struct AppState {
     pub desk: Arc<Desk>,
     /// One permit for each photo that may be decoded at once.
     pub decoding: Arc<Semaphore>,
+    /// Whether rows and files can be written.
+    pub writable: Arc<Writable>,
     /// Rung when a job was queued.
     pub bell: Arc<Notify>,
     /// Requests that change something, until they have.
@@ -61,6 +64,7 @@ impl AppState {
             metrics: Metrics::default(),
             desk: Arc::default(),
             decoding: decoders(),
+            writable: Arc::default(),
             bell: Arc::default(),
             answering: TaskTracker::new(),
             stop: CancellationToken::new(),

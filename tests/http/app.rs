@@ -284,6 +284,17 @@ impl App {
         app
     }
 
+    /// Without a worker, over a database that may grow by so many pages and no more, as on a disk that gets full.
+    pub async fn with_pages(more: u32) -> Self {
+        let mut app = Self::new(&[]).await;
+        let file = app.folder.path().join("bounded.db");
+        SqliteStore::open(&file).await.unwrap().close().await;
+        let pages = std::fs::metadata(&file).unwrap().len() / 4096;
+        app.store = Arc::new(SqliteStore::open_bounded(&file, Some(pages as u32 + more)).await.unwrap());
+        app.base = app.again(Limits::default(), Arc::default(), app.cancelled.clone()).await;
+        app
+    }
+
     /// Another service, without a worker, over what this one has stored.
     pub async fn beside(&self, limits: Limits) -> Beside<'_> {
         let stop = CancellationToken::new();

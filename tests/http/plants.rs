@@ -115,6 +115,39 @@ async fn the_service_tells_how_it_is() {
     assert_problem(app.get("/ready").await, 503, "unavailable", "storage");
 }
 
+/// Waits until `/ready` answers with this status.
+async fn ready_as(app: &App, wanted: StatusCode) -> serde_json::Value {
+    for _ in 0..600 {
+        let (status, answer) = app.get("/ready").await;
+        if status == wanted {
+            return answer;
+        }
+        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+    }
+    panic!("`/ready` does not answer {wanted}: {:?}", app.get("/ready").await);
+}
+
+#[tokio::test]
+async fn a_full_disk_is_said_by_ready_and_all_works_again_once_there_is_room() {
+    let app = App::with_pages(60).await;
+    assert_eq!(app.get("/ready").await.0, StatusCode::OK);
+    let plant = app.plant().await;
+    let surveys = format!("{plant}/surveys");
+    for index in 0.. {
+        let (status, answer) = app.post(&surveys, json!({"name": format!("{index} {}", "long".repeat(45))})).await;
+        if status != StatusCode::CREATED {
+            assert_problem((status, answer), 507, "storage_full", "make room");
+            break;
+        }
+    }
+    let problem = ready_as(&app, StatusCode::SERVICE_UNAVAILABLE).await;
+    assert_problem((StatusCode::SERVICE_UNAVAILABLE, problem), 503, "unavailable", "the database cannot be written");
+    assert_eq!(app.get(&plant).await.0, StatusCode::OK);
+    assert_eq!(app.request(Method::DELETE, &plant).send().await.unwrap().status(), StatusCode::NO_CONTENT);
+    ready_as(&app, StatusCode::OK).await;
+    app.plant().await;
+}
+
 #[tokio::test]
 async fn answers_come_as_they_can_be_read() {
     let app = App::new(&[]).await;

@@ -233,3 +233,20 @@ async fn a_photo_that_does_not_decode_is_refused() {
     broken[middle..middle + 64].fill(0xaa);
     assert_problem(app.put(&format!("{survey}/images/a.png"), broken).await, 422, "image_unreadable", "images/a.png");
 }
+
+#[tokio::test]
+async fn a_damaged_photo_has_its_verdict() {
+    let app = App::new(&[]).await;
+    let survey = app.survey().await;
+    let whole = photo(&picture(), 15);
+    let zeroed = |from: usize| [&whole[..from], &[0; 1000], &whole[from + 1000..]].concat();
+    for (name, bytes, damaged) in [
+        ("whole.jpg", whole.clone(), false),
+        ("middle.jpg", zeroed(whole.len() / 2), true),
+        ("half.jpg", [&whole[..whole.len() / 2], &[0xff, 0xd9]].concat(), true),
+    ] {
+        let file = put(&app, &survey, name, bytes).await;
+        assert_eq!(codes(&file).contains(&"damaged"), damaged, "{file}");
+    }
+    assert_eq!(names(&app, &format!("{survey}/images?warning=damaged")).await, ["half.jpg", "middle.jpg"]);
+}

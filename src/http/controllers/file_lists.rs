@@ -7,7 +7,8 @@ use crate::http::error::{ApiError, Code};
 /// Longest cursor: two digits for each byte of a path.
 const MAX_CURSOR: usize = 800;
 /// Words of all warnings of photos.
-const WARNINGS: [&str; 6] = ["blurred", "underexposed", "overexposed", "no_position", "no_time", "duplicate"];
+const WARNINGS: [&str; 7] =
+    ["damaged", "blurred", "underexposed", "overexposed", "no_position", "no_time", "duplicate"];
 
 /// The path after which a part begins: whatever the bytes of a cursor are, only their place in the order counts.
 pub fn path_of(cursor: Option<&str>) -> Result<String, ApiError> {

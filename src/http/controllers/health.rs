@@ -32,7 +32,7 @@ pub async fn health() -> Json<Health> {
     Json(FINE)
 }
 
-/// Whether database and blob store answer, and whether the process's worker has what it needs
+/// Whether database and blob store answer and can be written, and whether the process's worker has what it needs
 #[utoipa::path(
     get,
     path = "/ready",
@@ -49,6 +49,11 @@ pub async fn ready(State(state): State<AppState>) -> Result<Json<Health>, ApiErr
             tracing::error!(%error, "not ready");
             return Err(ApiError::new(Code::Unavailable, "the service's storage does not answer").retry_after(5));
         }
+    }
+    let faults = state.writable.faults(&*state.store, &state.blobs).await;
+    if !faults.is_empty() {
+        let detail = format!("{}; reading still works", faults.join(", and "));
+        return Err(ApiError::new(Code::Unavailable, detail).retry_after(5));
     }
     let lacks_detector = state.mapper.as_ref().is_some_and(|mapper| !mapper.has_detector());
     let warnings = lacks_detector.then_some(NO_DETECTOR).into_iter().collect();

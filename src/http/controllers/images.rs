@@ -100,7 +100,7 @@ pub struct PhotoView {
 
 impl From<PhotoFacts> for PhotoView {
     fn from(facts: PhotoFacts) -> Self {
-        let PhotoFacts { exposure, quality } = facts;
+        let PhotoFacts { exposure, quality, damaged: _ } = facts;
         // What cannot be told apart need not be told.
         let rounded = |value: f64| (value * 1e4).round() / 1e4;
         Self {
@@ -122,7 +122,7 @@ impl From<PhotoFacts> for PhotoView {
 /// Something that the pilot should know of a photo.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 pub struct PhotoWarning {
-    /// `blurred`, `underexposed`, `overexposed`, `no_position`, `no_time` or `duplicate`.
+    /// `damaged`, `blurred`, `underexposed`, `overexposed`, `no_position`, `no_time` or `duplicate`.
     #[schema(example = "blurred")]
     pub code: &'static str,
     /// What is wrong and what to do.
@@ -134,6 +134,9 @@ fn warnings(file: &FileRecord, twins: &[SurveyPath]) -> Vec<PhotoWarning> {
     let Some(photo) = &file.photo else { return Vec::new() };
     let mut warnings = Vec::new();
     let mut warn = |code, message: String| warnings.push(PhotoWarning { code, message });
+    if photo.damaged {
+        warn("damaged", "the data of its picture is damaged: copy it from the camera again, or take it again".into());
+    }
     for flaw in photo.quality.flaws() {
         match flaw {
             Flaw::Blurred => {
@@ -192,10 +195,10 @@ pub struct ImagesQuery {
     /// Only photos whose names begin so.
     #[param(max_length = 200, example = "DJI_00")]
     pub name: Option<String>,
-    /// Only photos with this warning: `blurred`, `underexposed`, `overexposed`, `no_position`, `no_time`, `duplicate`, or
+    /// Only photos with this warning: `damaged`, `blurred`, `underexposed`, `overexposed`, `no_position`, `no_time`, `duplicate`, or
     /// `any`; or with `none`.
     #[param(
-        pattern = "^(blurred|underexposed|overexposed|no_position|no_time|duplicate|any|none)$",
+        pattern = "^(damaged|blurred|underexposed|overexposed|no_position|no_time|duplicate|any|none)$",
         example = "blurred"
     )]
     pub warning: Option<String>,

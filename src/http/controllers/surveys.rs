@@ -102,9 +102,12 @@ pub struct FilesQuery {
     /// Only files whose places in the survey's folder begin so.
     #[param(max_length = 400, example = "undistorted/")]
     pub path: Option<String>,
-    /// Only files with this warning: `blurred`, `underexposed`, `overexposed`, `no_position`, `no_time`, `duplicate`, or
+    /// Only files with this warning: `damaged`, `blurred`, `underexposed`, `overexposed`, `no_position`, `no_time`, `duplicate`, or
     /// `any`; or with `none`, as all have that are no photos.
-    #[param(pattern = "^(blurred|underexposed|overexposed|no_position|no_time|duplicate|any|none)$", example = "any")]
+    #[param(
+        pattern = "^(damaged|blurred|underexposed|overexposed|no_position|no_time|duplicate|any|none)$",
+        example = "any"
+    )]
     pub warning: Option<String>,
 }
 

@@ -402,7 +402,7 @@ impl<R: Read + Seek> Tiff<R> {
 mod tests {
     use super::*;
     use exif::experimental::Writer;
-    use exif::{Field, Rational};
+    use exif::{Field, In, Rational, Tag, Value};
 
     /// A TIFF file with nothing in it but these fields.
     fn file(fields: &[Field]) -> tempfile::NamedTempFile {

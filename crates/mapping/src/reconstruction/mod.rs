@@ -1,5 +1,6 @@
 //! What structure from motion gives us, as one type, with one reader per producer.
 
+mod entropy;
 pub mod error;
 mod excerpt;
 pub mod exif;

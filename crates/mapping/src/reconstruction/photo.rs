@@ -1,6 +1,7 @@
 //! Photos: checked by their header before anything is decoded, decoded whole or refused, undistorted where the file is
 //! as the lens drew it.
 
+use super::entropy;
 use super::excerpt::{Excerpt, Parts};
 use super::exif::{self, Exposure};
 use super::jpeg::{self, JpegError};
@@ -273,6 +274,9 @@ pub struct PhotoFacts {
     #[serde(flatten)]
     pub exposure: Exposure,
     pub quality: Quality,
+    /// Whether the data of the picture is damaged within, so that what decoders show is not what the camera saw.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub damaged: bool,
 }
 
 /// Decodes a photo that [`inspect`] let through, and measures it.
@@ -291,7 +295,11 @@ pub fn examine(path: &Path, name: &str, header: PhotoHeader) -> Result<PhotoFact
             .map_err(|error| PhotoError::NotAnImage { name: name.to_owned(), what: error.to_string() })?;
         picture = shrunk;
     }
-    Ok(PhotoFacts { exposure: exif::read(path), quality: Quality::measure(&picture) })
+    let damaged = header.format == ImageFormat::Jpeg && {
+        let file = File::open(path).map_err(|source| PhotoError::Unreadable { name: name.to_owned(), source })?;
+        entropy::damage(BufReader::with_capacity(1 << 16, file)).is_some()
+    };
+    Ok(PhotoFacts { exposure: exif::read(path), quality: Quality::measure(&picture), damaged })
 }
 
 /// Decodes a photo. What is no part of the picture, metadata and what follows its end, does not come to the decoder.
