@@ -8,6 +8,7 @@ use heliomap::config::{
     BackupArgs, DoctorArgs, KeysArgs, LogArgs, OpenapiArgs, OrganisationsArgs, RestoreArgs, ServeArgs, TraceArgs,
     VerifyArgs, WorkerArgs, file,
 };
+use rustix::fs::Mode;
 use std::process::ExitCode;
 
 /// Maps photovoltaic plants from drone overview photos: every module georeferenced, with its place in the plant.
@@ -56,6 +57,22 @@ enum Command {
     Configuration,
 }
 
+impl Command {
+    /// Whether it writes a data folder or a copy of one.
+    fn keeps_data(&self) -> bool {
+        matches!(
+            self,
+            Self::Serve(_)
+                | Self::Worker(_)
+                | Self::Keys(_)
+                | Self::Organisations(_)
+                | Self::Backup(_)
+                | Self::Restore(_)
+                | Self::Verify(_)
+        )
+    }
+}
+
 fn main() -> ExitCode {
     match parse().and_then(traced) {
         Ok(()) => ExitCode::SUCCESS,
@@ -89,6 +106,10 @@ fn report(error: &anyhow::Error) -> String {
 }
 
 fn run(command: Command) -> anyhow::Result<()> {
+    if command.keeps_data() {
+        // What it writes is for the user that it runs as, and nobody else of the machine.
+        rustix::process::umask(Mode::RWXG | Mode::RWXO);
+    }
     match command {
         Command::Serve(args) => commands::serve::run(args),
         Command::Worker(args) => commands::worker::run(args),

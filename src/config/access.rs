@@ -58,7 +58,7 @@ pub enum KeysCommand {
 }
 
 fn parse_name(text: &str) -> Result<String, name::InvalidName> {
-    name::checked(text).map(str::to_owned)
+    name::checked(text)
 }
 
 fn parse_key_id(text: &str) -> Result<KeyId, uuid::Error> {

@@ -28,6 +28,11 @@ macro_rules! codes {
             /// All kinds.
             pub const ALL: &[Self] = &[$(Self::$name),*];
 
+            /// The kind that a word is of.
+            pub fn of_word(word: &str) -> Option<Self> {
+                Self::ALL.iter().copied().find(|code| code.parts().1 == word)
+            }
+
             /// Status, word and title.
             pub fn parts(self) -> (StatusCode, &'static str, &'static str) {
                 match self {
@@ -84,6 +89,14 @@ codes! {
     ImageUnreadable = UNPROCESSABLE_ENTITY, "image_unreadable", "The file is no image that can be read";
     ImageTruncated = UNPROCESSABLE_ENTITY, "image_truncated", "The image is cut short";
     FileUnreadable = UNPROCESSABLE_ENTITY, "file_unreadable", "The file does not hold what its name says";
+    ReconstructionMalformed = UNPROCESSABLE_ENTITY, "reconstruction_malformed", "The file is not what OpenSfM writes";
+    ReconstructionNotFinite = UNPROCESSABLE_ENTITY, "reconstruction_not_finite", "The file holds numbers that are none";
+    CameraModelUnknown = UNPROCESSABLE_ENTITY, "camera_model_unknown", "The cameras are of a model that is not read";
+    TooFewImages = UNPROCESSABLE_ENTITY, "too_few_images", "The reconstruction is of too few images";
+    PointCloudEmpty = UNPROCESSABLE_ENTITY, "point_cloud_empty", "The point cloud holds no points";
+    PointCloudTruncated = UNPROCESSABLE_ENTITY, "point_cloud_truncated", "The point cloud is cut short";
+    PointCloudTooLarge = UNPROCESSABLE_ENTITY, "point_cloud_too_large", "The point cloud has too many points";
+    BoxesInvalid = UNPROCESSABLE_ENTITY, "boxes_invalid", "The boxes cannot be used";
     FilesRefused = UNPROCESSABLE_ENTITY, "files_refused", "Some files were refused";
     ArchiveUnsafe = UNPROCESSABLE_ENTITY, "archive_unsafe", "The archive holds entries that no archive should";
     ArchiveUnreadable = UNPROCESSABLE_ENTITY, "archive_unreadable", "The archive cannot be read";
@@ -136,7 +149,7 @@ impl ApiError {
 
     /// A problem of which the document was kept.
     pub fn told_before(document: &Value) -> Self {
-        let code = Code::ALL.iter().copied().find(|code| document["code"] == code.parts().1);
+        let code = document["code"].as_str().and_then(Code::of_word);
         let detail = document["detail"].as_str().unwrap_or("the same was refused before").to_owned();
         let mut problem = Self::new(code.unwrap_or(Code::BadRequest), detail);
         let own = ["type", "title", "status", "code", "detail"];

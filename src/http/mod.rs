@@ -10,6 +10,7 @@ mod extract;
 mod middleware;
 mod paging;
 mod server;
+mod turns;
 mod uploads;
 mod writable;
 
@@ -17,5 +18,6 @@ pub use middleware::rates::Rates;
 pub use router::{openapi, router};
 pub use server::serve;
 pub use state::AppState;
+pub use turns::Turns;
 pub use uploads::tus::Desk;
 pub use writable::Writable;

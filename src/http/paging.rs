@@ -6,6 +6,7 @@ use axum::Json;
 use axum::http::{HeaderValue, header};
 use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
+use unicode_normalization::UnicodeNormalization;
 
 const DEFAULT_LIMIT: u32 = 100;
 const MAX_LIMIT: u32 = 1000;
@@ -73,7 +74,7 @@ pub fn prefix_filter(asked: Option<&str>) -> Result<String, ApiError> {
     if asked.chars().count() > 200 {
         return Err(ApiError::new(Code::InvalidQuery, "name is longer than 200 characters, as no name is"));
     }
-    Ok(asked.replace('\0', "\u{1}"))
+    Ok(asked.nfc().collect::<String>().replace('\0', "\u{1}"))
 }
 
 /// Reads a word that a list is filtered by, one of those of a state.

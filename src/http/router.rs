@@ -7,6 +7,7 @@ use super::controllers::{
 use super::description::examples;
 use super::error;
 use super::middleware::access::{Gate, Policy};
+use super::middleware::head::{self, MAX_JSON_BYTES};
 use super::middleware::{access, admission, conditional, encoding, idempotency, loopback};
 use super::state::AppState;
 use super::uploads::tus;
@@ -33,9 +34,6 @@ use tracing::Span;
 use utoipa::OpenApi;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
-
-/// Largest JSON body.
-const MAX_JSON_BYTES: usize = 1 << 20;
 
 const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
 
@@ -123,7 +121,8 @@ pub fn openapi() -> utoipa::openapi::OpenApi {
 /// The whole service.
 pub fn router(state: AppState) -> Router {
     let timeout = TimeoutLayer::with_status_code(StatusCode::REQUEST_TIMEOUT, state.limits.request_timeout);
-    let prompt = prompt().layer(DefaultBodyLimit::max(MAX_JSON_BYTES)).layer(timeout);
+    let small = middleware::from_fn(head::small);
+    let prompt = prompt().layer(DefaultBodyLimit::max(MAX_JSON_BYTES)).layer(small).layer(timeout);
     let admission = middleware::from_fn_with_state(state.clone(), admission::admit);
     let uploads = uploads().layer(DefaultBodyLimit::disable()).layer(admission);
     let (router, description) = OpenApiRouter::new().merge(prompt).merge(uploads).split_for_parts();
@@ -140,6 +139,7 @@ pub fn router(state: AppState) -> Router {
         .with_state(state)
         // The innermost first.
         .layer(tower::util::option_layer(local))
+        .layer(middleware::from_fn(head::unambiguous))
         .layer(CatchPanicLayer::custom(panicked))
         .layer(middleware::map_response(error::only_problems))
         // A plant is megabytes of JSON, which little effort makes small.

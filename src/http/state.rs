@@ -3,6 +3,7 @@
 use crate::config::{Limits, NetworkArgs};
 use crate::http::error::{ApiError, Code};
 use crate::http::middleware::rates::Rates;
+use crate::http::turns::Turns;
 use crate::http::uploads::tus::Desk;
 use crate::http::writable::Writable;
 use crate::jobs::PipelineMapper;
@@ -12,7 +13,7 @@ use crate::telemetry::Metrics;
 use crate::webhooks::Targets;
 use heliomap_model::PlantId;
 use std::sync::Arc;
-use tokio::sync::{Notify, Semaphore};
+use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
@@ -26,8 +27,8 @@ pub struct AppState {
     pub metrics: Metrics,
     pub rates: Arc<Rates>,
     pub desk: Arc<Desk>,
-    /// One permit for each photo that may be decoded at once.
-    pub decoding: Arc<Semaphore>,
+    /// Turns at looking through what came: photos are decoded.
+    pub checking: Turns,
     /// Whether rows and files can be written.
     pub writable: Arc<Writable>,
     /// Rung when a job was queued.
@@ -47,9 +48,9 @@ pub struct AppState {
 }
 
 /// How many photos may be decoded at once: half of the cores answer requests.
-fn decoders() -> Arc<Semaphore> {
+fn decoders() -> Turns {
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
-    Arc::new(Semaphore::new((cores / 2).max(1)))
+    Turns::new((cores / 2).max(1))
 }
 
 impl AppState {
@@ -63,7 +64,7 @@ impl AppState {
             network: Arc::default(),
             metrics: Metrics::default(),
             desk: Arc::default(),
-            decoding: decoders(),
+            checking: decoders(),
             writable: Arc::default(),
             bell: Arc::default(),
             answering: TaskTracker::new(),

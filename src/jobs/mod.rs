@@ -15,6 +15,6 @@ mod rows;
 mod watch;
 
 pub use mapper::{FoundInTask, Mapper, NextTask, PipelineMapper, Stopped};
-pub use readiness::{Missing, RECONSTRUCTIONS, is_shot, missing, shots, shots_without_image};
+pub use readiness::{Missing, RECONSTRUCTIONS, ShotNames, missing, shots, shots_without_image};
 pub use settings::WorkerSettings;
 pub use worker::Worker;

@@ -24,8 +24,17 @@ fn feature(feature: &Value) -> NewFeature {
         id: text(&feature["id"]),
         label: text(&feature["properties"]["label"]),
         json: feature.to_string(),
-        extent: GeoBox::around(positions),
+        extent: extent(&positions),
     }
+}
+
+/// The box around positions; of a feature across the line of 180 degrees one that goes on beyond it.
+fn extent(positions: &[[f64; 2]]) -> Option<GeoBox> {
+    let extent = GeoBox::around(positions.iter().copied())?;
+    if extent.width_deg() <= 180.0 {
+        return Some(extent);
+    }
+    GeoBox::around(positions.iter().map(|[lon, lat]| [if *lon < 0.0 { lon + 360.0 } else { *lon }, *lat]))
 }
 
 /// The longitudes and latitudes of coordinates nested however deep.
@@ -53,5 +62,8 @@ mod tests {
         assert_eq!((row.id.as_str(), row.label.as_str()), ("a", "L01"));
         assert_eq!(row.extent, Some(GeoBox { min_lon: 1.0, min_lat: 49.0, max_lon: 2.0, max_lat: 51.0 }));
         assert_eq!(feature(&json!({"id": "b", "geometry": null})).extent, None);
+        let across = json!({"geometry": {"coordinates": [[[[179.0, 1.0, 0.0], [180.0, 2.0, 0.0]]], [[[-180.0, 1.0], [-178.0, 2.0]]]]}});
+        let extent = GeoBox { min_lon: 179.0, min_lat: 1.0, max_lon: 182.0, max_lat: 2.0 };
+        assert_eq!(feature(&across).extent, Some(extent));
     }
 }

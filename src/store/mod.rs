@@ -51,7 +51,7 @@ pub use repository::{Pool, Store};
 pub use requests::RequestStore;
 pub use secret::Secret;
 pub use sqlite::SqliteStore;
-pub use survey_path::{Content, FileKind, ImageName, InvalidPath, SurveyPath};
+pub use survey_path::{Content, FileKind, ImageName, InvalidPath, SurveyPath, looks_like_photo};
 pub use surveys::{FileRecord, FileWritten, Survey, SurveyStore, Wanted};
 pub use tasks::{GivenBack, ImageTask, OwnTask, TaskClaim, TaskStore};
 pub use uploads::{Upload, UploadBounds, UploadStore};

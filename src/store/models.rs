@@ -86,7 +86,7 @@ pub struct Feature {
     pub json: String,
 }
 
-/// A box of longitudes and latitudes, degrees.
+/// A box of longitudes and latitudes, degrees. One across the line of 180 degrees goes on beyond it: its east is more than 180.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GeoBox {
     pub min_lon: f64,
@@ -116,6 +116,14 @@ impl GeoBox {
             max_lon: self.max_lon.max(other.max_lon),
             max_lat: self.max_lat.max(other.max_lat),
         }
+    }
+
+    /// This box where features may be that begin from -180 to 180 and are at most so wide: the box, and what of it lies a turn
+    /// about the globe to the west or to the east.
+    pub fn turns(self, widest_deg: f64) -> impl Iterator<Item = Self> {
+        let turned = move |by: f64| Self { min_lon: self.min_lon + by, max_lon: self.max_lon + by, ..self };
+        let reached = move |turned: &Self| turned.min_lon <= 180.0 + widest_deg && turned.max_lon >= -180.0;
+        [0.0, -360.0, 360.0].into_iter().map(turned).filter(reached)
     }
 
     /// Degrees from west to east.

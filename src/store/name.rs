@@ -1,5 +1,7 @@
 //! Names of organisations, plants, surveys and keys.
 
+use unicode_normalization::UnicodeNormalization;
+
 /// Maximum number of characters of a name.
 const MAX_CHARACTERS: usize = 200;
 
@@ -8,9 +10,9 @@ const MAX_CHARACTERS: usize = 200;
 #[error("a name has 1 to {MAX_CHARACTERS} characters, no line breaks and none that steer how text is shown")]
 pub struct InvalidName;
 
-/// Validates a name and trims spaces around it.
-pub fn checked(name: &str) -> Result<&str, InvalidName> {
-    let name = name.trim();
+/// Validates a name, trims spaces around it, and composes it (Unicode's NFC): what looks the same is the same name.
+pub fn checked(name: &str) -> Result<String, InvalidName> {
+    let name: String = name.trim().nfc().collect();
     let length = name.chars().count();
     if (1..=MAX_CHARACTERS).contains(&length) && !name.chars().any(steers) { Ok(name) } else { Err(InvalidName) }
 }
@@ -30,9 +32,10 @@ mod tests {
     fn names_are_one_visible_line() {
         for name in ["Sunfield North", "太陽光発電所", "محطة الطاقة", "👩\u{200d}🔧", &"x".repeat(200)]
         {
-            assert_eq!(checked(name), Ok(name));
+            assert_eq!(checked(name).as_deref(), Ok(name));
         }
-        assert_eq!(checked("  a \n"), Ok("a"));
+        assert_eq!(checked("  a \n").as_deref(), Ok("a"));
+        assert_eq!(checked("Ho\u{308}he"), checked("H\u{f6}he"));
         for name in ["", " ", "a\nb", "a\0", "gpj.\u{202e}a", "a\u{2066}b\u{2069}", "a\u{2028}b", &"x".repeat(201)] {
             assert_eq!(checked(name), Err(InvalidName), "{name:?}");
         }

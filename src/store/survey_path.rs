@@ -3,6 +3,7 @@
 
 use super::name::steers;
 use std::fmt;
+use unicode_normalization::UnicodeNormalization;
 
 /// Names longer than this do not fit every file system.
 const MAX_NAME_BYTES: usize = 200;
@@ -11,15 +12,23 @@ const MAX_NAME_BYTES: usize = 200;
 const IMAGE_ENDINGS: [&str; 5] = ["jpg", "jpeg", "png", "tif", "tiff"];
 
 /// The reconstruction's files that are no images.
-const RECONSTRUCTION_FILES: [&str; 7] = [
+const RECONSTRUCTION_FILES: [&str; 9] = [
     "boxes.json",
     "reconstruction.json",
+    "reconstruction.topocentric.json",
     "reference_lla.json",
     "camera_models.json",
     "undistorted/reconstruction.json",
     "undistorted/undistorted_shot_ids.json",
     "undistorted/depthmaps/merged.ply",
+    "odm_georeferencing/coords.txt",
 ];
+
+/// Whether a file has an image's ending and is none of the hidden files that systems put beside photos.
+pub fn looks_like_photo(name: &str) -> bool {
+    let ending = name.rsplit_once('.').map(|(_, ending)| ending.to_ascii_lowercase());
+    !name.starts_with('.') && ending.is_some_and(|ending| IMAGE_ENDINGS.contains(&ending.as_str()))
+}
 
 /// Why a text is no place in a survey's folder.
 #[derive(Debug, thiserror::Error, PartialEq, Eq)]
@@ -31,7 +40,8 @@ pub enum InvalidPath {
     #[error(
         "`{path}` is no file of a reconstruction: expected are boxes.json, reconstruction.json, reference_lla.json, \
          camera_models.json, undistorted/reconstruction.json, undistorted/undistorted_shot_ids.json, \
-         undistorted/images/NAME and undistorted/depthmaps/merged.ply"
+         undistorted/images/NAME and undistorted/depthmaps/merged.ply, of ODM also reconstruction.topocentric.json and \
+         odm_georeferencing/coords.txt"
     )]
     Unknown { path: String },
 }
@@ -64,15 +74,19 @@ pub enum Content {
         array: bool,
     },
     Ply,
+    /// Lines of text.
+    Text,
 }
 
-/// The file name of an image.
+/// The file name of an image, in Unicode's composed form (NFC): file systems and archives decompose names, which look the
+/// same.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct ImageName(String);
 
 impl ImageName {
     /// Reads a name: one path component that every file system takes, with the ending of an image.
     pub fn parse(name: &str) -> Result<Self, InvalidPath> {
+        let name = &*name.nfc().collect::<String>();
         let refuse = |reason| Err(InvalidPath::Name { name: name.chars().take(80).collect(), reason });
         if name.is_empty() {
             return refuse("it is empty");
@@ -127,12 +141,22 @@ impl SurveyPath {
         }
     }
 
+    /// Whether some file of a reconstruction has this name.
+    pub fn is_file_of_reconstruction(name: &str) -> bool {
+        RECONSTRUCTION_FILES.iter().any(|path| path.rsplit('/').next() == Some(name))
+    }
+
     /// Any place in the folder.
     pub fn parse(path: &str) -> Result<Self, InvalidPath> {
         match path.strip_prefix("images/") {
             Some(name) => Ok(Self::of_image(&ImageName::parse(name)?)),
             None => Self::of_reconstruction(path),
         }
+    }
+
+    /// A place as an earlier version may have stored it: checked, and not brought to another Unicode form.
+    pub fn stored(path: String) -> Result<Self, InvalidPath> {
+        Self::parse(&path).map(|_| Self(path))
     }
 
     /// The path with `/` between its components, relative to the survey's folder.
@@ -153,8 +177,9 @@ impl SurveyPath {
     /// What the file must contain.
     pub fn content(&self) -> Content {
         match self.0.rsplit('.').next() {
-            Some("json") => Content::Json { array: self.file_name() == "reconstruction.json" },
+            Some("json") => Content::Json { array: self.file_name().starts_with("reconstruction.") },
             Some("ply") => Content::Ply,
+            Some("txt") => Content::Text,
             _ => Content::Image,
         }
     }
@@ -175,6 +200,7 @@ mod tests {
         for name in ["", "..", "../a.jpg", "a/b.jpg", "a\\b.jpg", ".a.jpg", "a.jpg\0", "a.exe", "jpg", "C:a.jpg"] {
             assert!(ImageName::parse(name).is_err(), "{name:?}");
         }
+        assert_eq!(ImageName::parse("ho\u{308}he.jpg"), ImageName::parse("h\u{f6}he.jpg"));
         for name in ["DJI_0001.JPG", "DJI 0001 (2).jpg", "höhe.png", "x.JPG.jpg", "a..b.tif"] {
             assert_eq!(ImageName::parse(name).unwrap().as_str(), name);
         }

@@ -1,5 +1,6 @@
 //! A service of its own for each test.
 
+use crate::stub::{RECONSTRUCTION, REFERENCE};
 use axum::http::HeaderValue;
 use heliomap::config::{Limits, NetworkArgs};
 use heliomap::http::{AppState, router, serve};
@@ -475,8 +476,7 @@ impl App {
             let (status, answer) = self.put(&format!("{survey}/images/{name}"), jpeg(32, 24)).await;
             assert_eq!(status, StatusCode::CREATED, "{answer}");
         }
-        for (path, body) in [("reconstruction.json", "[{\"shots\": {}}]"), ("reference_lla.json", "{\"latitude\": 50}")]
-        {
+        for (path, body) in [("reconstruction.json", RECONSTRUCTION), ("reference_lla.json", REFERENCE)] {
             let (status, answer) = self.put(&format!("{survey}/reconstruction/{path}"), body).await;
             assert_eq!(status, StatusCode::CREATED, "{answer}");
         }

@@ -18,6 +18,7 @@ mod quotas;
 mod reconstruction;
 mod replaced;
 mod sharing;
+mod stub;
 mod tenants;
 mod tus;
 mod verdicts;

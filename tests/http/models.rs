@@ -71,7 +71,8 @@ async fn parts_and_boxes() {
     for (query, names) in [
         ("bbox=1,2,3", "bbox"),
         ("bbox=1,2,3,x", "bbox"),
-        ("bbox=3,1,2,2", "bbox"),
+        ("bbox=181,1,2,2", "bbox"),
+        ("bbox=3,2,4,1", "bbox"),
         ("limit=0", "limit"),
         ("box=1", "box"),
     ] {

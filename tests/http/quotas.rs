@@ -1,6 +1,7 @@
 //! What an organisation may keep, and no more.
 
 use crate::app::{Act, App, assert_problem, jpeg, json_of, plant_path};
+use crate::stub::{RECONSTRUCTION, REFERENCE, cloud};
 use heliomap::config::Limits;
 use heliomap::store::{OrganisationId, Quotas};
 use reqwest::{Method, StatusCode};
@@ -20,7 +21,7 @@ async fn uploads_beyond_the_quota_are_refused_and_what_is_kept_is_told() {
     let (_, usage) = app.get("/api/v1/usage").await;
     let bytes = usage["bytes"].as_u64().unwrap();
     // Two photos of the same bytes count once.
-    let files = [jpeg(32, 24).len(), "[{\"shots\": {}}]".len(), "{\"latitude\": 50}".len()];
+    let files = [jpeg(32, 24).len(), RECONSTRUCTION.len(), REFERENCE.len()];
     assert_eq!(bytes, files.iter().sum::<usize>() as u64);
     assert_eq!(usage, json!({"bytes": bytes, "announced_bytes": 0, "max_bytes": QUOTA, "plants": 1, "max_plants": 2}));
 
@@ -49,7 +50,7 @@ async fn uploads_beyond_the_quota_are_refused_and_what_is_kept_is_told() {
 
     // An archive that unpacks to more than fits.
     let mut archive = tar::Builder::new(flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::best()));
-    let cloud = [b"ply\n".to_vec(), vec![b' '; QUOTA as usize]].concat();
+    let cloud = cloud(QUOTA as usize);
     let mut header = tar::Header::new_gnu();
     header.set_size(cloud.len() as u64);
     header.set_mode(0o644);
@@ -88,7 +89,7 @@ async fn what_is_kept_may_be_sent_again_whatever_room_there_is() {
     let survey = app.complete_survey().await;
     let used = app.get("/api/v1/usage").await.1["bytes"].as_u64().unwrap();
     // Fills the quota but for a byte.
-    let cloud = [b"ply\n".to_vec(), vec![b' '; (QUOTA - used - 5) as usize]].concat();
+    let cloud = cloud((QUOTA - used - 1) as usize);
     let place = format!("{survey}/reconstruction/undistorted/depthmaps/merged.ply");
     assert_eq!(app.put(&place, cloud.clone()).await.0, StatusCode::CREATED);
     let full = app.get("/api/v1/usage").await.1;
@@ -103,12 +104,12 @@ async fn what_is_kept_may_be_sent_again_whatever_room_there_is() {
     let form = app.request(Method::POST, &format!("{survey}/images")).multipart(form).send().await.unwrap();
     let (status, again) = json_of(form).await;
     assert_eq!((status, &again["files"][0]["result"]), (StatusCode::OK, &json!("unchanged")), "{again}");
-    let document = b"[{\"shots\": {}}]";
+    let document = RECONSTRUCTION.as_bytes();
     let mut archive = tar::Builder::new(Vec::new());
     let mut header = tar::Header::new_gnu();
     header.set_size(document.len() as u64);
     header.set_mode(0o644);
-    archive.append_data(&mut header, "reconstruction.json", &document[..]).unwrap();
+    archive.append_data(&mut header, "reconstruction.json", document).unwrap();
     let (status, again) = app.put(&format!("{survey}/reconstruction"), archive.into_inner().unwrap()).await;
     assert_eq!((status, &again["files"][0]["result"]), (StatusCode::OK, &json!("unchanged")), "{again}");
     let photo = jpeg(32, 24);

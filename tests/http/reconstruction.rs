@@ -1,4 +1,5 @@
 use crate::app::{App, assert_problem, encoded, jpeg};
+use crate::stub;
 use flate2::Compression;
 use flate2::write::GzEncoder;
 use heliomap::config::Limits;
@@ -7,8 +8,8 @@ use serde_json::{Value, json};
 use std::io::{Cursor, Read, Write};
 use zip::write::{FullFileOptions, SimpleFileOptions};
 
-const RECONSTRUCTION: &[u8] = b"[{\"shots\": {}}]";
-const REFERENCE: &[u8] = b"{\"latitude\": 50.0, \"longitude\": 8.0, \"altitude\": 0.0}";
+const RECONSTRUCTION: &[u8] = stub::RECONSTRUCTION.as_bytes();
+const REFERENCE: &[u8] = stub::REFERENCE.as_bytes();
 
 fn zip(entries: &[(&str, &[u8])]) -> Vec<u8> {
     let mut archive = zip::ZipWriter::new(Cursor::new(Vec::new()));
@@ -78,7 +79,9 @@ async fn files_of_a_reconstruction_are_checked() {
         ("undistorted/reconstruction.json", RECONSTRUCTION),
         ("undistorted/undistorted_shot_ids.json", b"{}"),
         ("undistorted/images/a.JPG.jpg", &jpeg(8, 8)),
-        ("undistorted/depthmaps/merged.ply", b"ply\nformat ascii 1.0\n"),
+        ("undistorted/depthmaps/merged.ply", &stub::cloud(500)),
+        ("reconstruction.topocentric.json", RECONSTRUCTION),
+        ("odm_georeferencing/coords.txt", b"WGS84 UTM 32N\n500000 5500000\n"),
     ] {
         let (status, answer) = put(path, body).await;
         assert_eq!((status, &answer["path"]), (StatusCode::CREATED, &json!(path)), "{answer}");
@@ -86,17 +89,48 @@ async fn files_of_a_reconstruction_are_checked() {
     assert_problem(put("reports/x.json", b"{}").await, 422, "unknown_file", "reports/x.json");
     assert_problem(put("../reconstruction.json", b"[]").await, 404, "not_found", "");
     assert_problem(put("..%2freconstruction.json", b"[]").await, 422, "unknown_file", "..");
-    assert_problem(
-        put("reconstruction.json", b"{}").await,
-        422,
-        "file_unreadable",
-        "reconstruction.json is no JSON array",
-    );
-    assert_problem(put("reconstruction.json", b"[{").await, 422, "file_unreadable", "cut short");
-    assert_problem(put("reconstruction.json", b"").await, 422, "file_unreadable", "empty");
-    assert_problem(put("reconstruction.json", b"[NaN]").await, 422, "file_unreadable", "NaN");
-    assert_problem(put("reference_lla.json", b"[]").await, 422, "file_unreadable", "reference_lla.json");
-    assert_problem(put("undistorted/depthmaps/merged.ply", b"plop").await, 422, "file_unreadable", "merged.ply");
+    let short = String::from_utf8(stub::cloud(500)).unwrap().replace("vertex 1", "vertex 300");
+    let one = stub::reconstruction_of(&[&["a.jpg"]]);
+    let unknown = stub::RECONSTRUCTION.replace("perspective", "equirectangular");
+    for (path, body, code, words) in [
+        (
+            "reconstruction.json",
+            b"{}".as_slice(),
+            "reconstruction_malformed",
+            "reconstruction.json is not what OpenSfM",
+        ),
+        ("reconstruction.json", b"[{", "reconstruction_malformed", "cut short"),
+        ("reconstruction.json", b"", "reconstruction_malformed", "cut short"),
+        ("reconstruction.json", b"[NaN]", "reconstruction_not_finite", "reconstruction.json holds NaN"),
+        ("reconstruction.json", b"[]", "too_few_images", "holds 0 shots"),
+        ("reconstruction.json", one.as_bytes(), "too_few_images", "holds 1 shots"),
+        ("reconstruction.json", unknown.as_bytes(), "camera_model_unknown", "equirectangular"),
+        ("undistorted/reconstruction.json", b"[7]", "reconstruction_malformed", "undistorted/reconstruction.json"),
+        ("undistorted/undistorted_shot_ids.json", b"[]", "reconstruction_malformed", "undistorted_shot_ids.json"),
+        ("reference_lla.json", b"[]", "reconstruction_malformed", "reference_lla.json"),
+        ("reference_lla.json", b"{}", "reconstruction_malformed", "latitude"),
+        (
+            "reference_lla.json",
+            b"{\"latitude\": 95, \"longitude\": 0, \"altitude\": 0}",
+            "reconstruction_malformed",
+            "no place on earth",
+        ),
+        ("camera_models.json", b"[]", "file_unreadable", "camera_models.json"),
+        ("boxes.json", b"{\"images\": 1}", "boxes_invalid", "boxes.json"),
+        ("undistorted/depthmaps/merged.ply", b"plop", "reconstruction_malformed", "merged.ply"),
+        (
+            "undistorted/depthmaps/merged.ply",
+            short.as_bytes(),
+            "point_cloud_truncated",
+            "merged.ply promises 300 points",
+        ),
+        ("odm_georeferencing/coords.txt", b"\xff\xfe", "file_unreadable", "coords.txt"),
+    ] {
+        let (status, problem) = put(path, body).await;
+        let incoming = app.folder.path().to_str().unwrap();
+        assert!(!problem.to_string().contains(incoming), "{problem}");
+        assert_problem((status, problem), 422, code, words);
+    }
     assert_problem(put("undistorted/images/a.jpg", b"x").await, 422, "image_unreadable", "undistorted/images/a.jpg");
 }
 
@@ -176,7 +210,12 @@ async fn bad_archives_are_refused_as_a_whole() {
 
     let png = encoded(8, 8, image::ImageFormat::Png);
     assert_problem(put(zip(&[good, ("images/a.jpg", &png)])).await, 422, "image_format_mismatch", "images/a.jpg");
-    assert_problem(put(zip(&[("reconstruction.json", b"{}")])).await, 422, "file_unreadable", "reconstruction.json");
+    assert_problem(
+        put(zip(&[("reconstruction.json", b"{}")])).await,
+        422,
+        "reconstruction_malformed",
+        "reconstruction.json",
+    );
     let twice = tar(&[file, file]);
     assert_problem(put(twice).await, 422, "archive_unsafe", "reconstruction.json");
 
@@ -247,13 +286,15 @@ async fn an_archive_that_would_fill_the_disk_is_refused() {
 async fn a_reconstruction_of_more_images_than_any_survey_has_is_refused() {
     let app = App::new(&[]).await;
     let survey = app.survey().await;
+    let pose = r#"{"rotation":[0,0,0],"translation":[0,0,1],"camera":"c"}"#;
+    let camera = r#"{"projection_type":"perspective","width":32,"height":24,"focal":0.8}"#;
     let component = |from: usize| {
-        let shots: Vec<String> = (from..from + 60_000).map(|shot| format!("\"{shot}.jpg\":0")).collect();
-        format!("{{\"shots\":{{{}}}}}", shots.join(","))
+        let shots: Vec<String> = (from..from + 60_000).map(|shot| format!("\"{shot}.jpg\":{pose}")).collect();
+        format!("{{\"cameras\":{{\"c\":{camera}}},\"shots\":{{{}}}}}", shots.join(","))
     };
     let put = async |body: String| app.put(&format!("{survey}/reconstruction/reconstruction.json"), body).await;
     let both = format!("[{},{}]", component(0), component(60_000));
-    assert_problem(put(both).await, 422, "file_unreadable", "more than 100000 images");
+    assert_problem(put(both).await, 422, "reconstruction_malformed", "more than 100000 images");
     assert_eq!(put(format!("[{}]", component(0))).await.0, StatusCode::CREATED);
     let (_, told) = app.get(&format!("{survey}?limit=1")).await;
     assert_eq!(told["images"]["not_uploaded_count"], 60_000);

@@ -1,6 +1,7 @@
 //! Uploads that may be resumed.
 
 use crate::app::{App, assert_problem, jpeg, json_of};
+use crate::stub::RECONSTRUCTION;
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
 use futures::StreamExt;
@@ -148,7 +149,7 @@ async fn some_came(app: &App, upload: &str) {
 
 /// A reconstruction of a megabyte, in two pieces.
 fn large() -> [Vec<u8>; 2] {
-    let document = format!("[{{\"shots\": {{}}}}]{}", " ".repeat(1 << 20)).into_bytes();
+    let document = format!("{RECONSTRUCTION}{}", " ".repeat(1 << 20)).into_bytes();
     let (first, rest) = document.split_at(600_000);
     [first.to_vec(), rest.to_vec()]
 }
@@ -271,10 +272,10 @@ async fn an_archive_may_be_resumed_too() {
     let app = App::new(&[]).await;
     let survey = app.survey().await;
     let mut archive = tar::Builder::new(Vec::new());
-    let document = b"[{\"shots\": {}}]";
+    let document = RECONSTRUCTION.as_bytes();
     let mut header = tar::Header::new_ustar();
     header.set_size(document.len() as u64);
-    archive.append_data(&mut header, "reconstruction.json", &document[..]).unwrap();
+    archive.append_data(&mut header, "reconstruction.json", document).unwrap();
     let archive = archive.into_inner().unwrap();
     let upload = begin(&app, &survey, archive.len(), &metadata("path", "reconstruction")).await;
     assert_eq!(more(&app, &upload, 0, &archive).send().await.unwrap().status(), StatusCode::NO_CONTENT);

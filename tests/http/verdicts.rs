@@ -1,6 +1,7 @@
 //! What the pilot hears of the photos before leaving the field.
 
 use crate::app::{App, assert_problem, json_of};
+use crate::stub;
 use exif::experimental::Writer;
 use exif::{Field, In, Rational, Tag, Value as Exif};
 use image::{GrayImage, Luma};
@@ -130,7 +131,7 @@ async fn walked(app: &App, first: &str, list: &str, member: &str) -> Vec<String>
 async fn the_files_of_a_survey_are_told_in_part() {
     let app = App::new(&[]).await;
     let survey = flown(&app).await;
-    app.put(&format!("{survey}/reconstruction/reconstruction.json"), "[{\"shots\": {}}]").await;
+    app.put(&format!("{survey}/reconstruction/reconstruction.json"), stub::RECONSTRUCTION).await;
     let undistorted = format!("{survey}/reconstruction/undistorted/images/good.jpg");
     assert_eq!(app.put(&undistorted, photo(&picture(), 45)).await.0, StatusCode::CREATED);
     let paths = async |query: &str| walked(&app, &format!("{survey}?limit=1&{query}"), "files", "path").await;
@@ -200,9 +201,9 @@ async fn a_survey_says_what_is_complete_and_what_is_missing() {
     };
     assert_eq!(codes(&told), ["no_reconstruction", "no_reference"]);
 
-    let reconstruction = json!([{"shots": {"good.jpg": {}, "lost.jpg": {}}}, {"shots": {"blurred.jpg": {"x": [1]}}}]);
-    for (path, body) in [("reconstruction.json", reconstruction), ("reference_lla.json", json!({"latitude": 50}))] {
-        let (status, answer) = app.put(&format!("{survey}/reconstruction/{path}"), body.to_string()).await;
+    let reconstruction = stub::reconstruction_of(&[&["good.jpg", "lost.jpg"], &["blurred.jpg"]]);
+    for (path, body) in [("reconstruction.json", reconstruction), ("reference_lla.json", stub::REFERENCE.to_owned())] {
+        let (status, answer) = app.put(&format!("{survey}/reconstruction/{path}"), body).await;
         assert_eq!(status, StatusCode::CREATED, "{answer}");
     }
     let (_, told) = app.get(&survey).await;

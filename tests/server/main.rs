@@ -6,6 +6,8 @@ mod boxes;
 
 mod configuration;
 mod doctor;
+#[path = "../common/stub.rs"]
+mod stub;
 mod traces;
 mod upgrade;
 mod uploads;
@@ -106,7 +108,7 @@ fn jpeg_of(width: u32) -> Vec<u8> {
     bytes.into_inner()
 }
 
-/// A survey that looks complete but whose reconstruction is broken; its path and its job.
+/// A survey that looks complete but whose reconstruction has no points; its path and its job.
 fn broken_survey_with_job(client: &Client, base: &str) -> (String, Value) {
     let post = |path: &str, body: Value| -> Value {
         client.post(format!("{base}{path}")).json(&body).send().unwrap().json().unwrap()
@@ -117,8 +119,8 @@ fn broken_survey_with_job(client: &Client, base: &str) -> (String, Value) {
     for (path, body) in [
         ("images/a.jpg", jpeg()),
         ("images/b.jpg", jpeg()),
-        ("reconstruction/reconstruction.json", b"[{\"shots\": 7}]".to_vec()),
-        ("reconstruction/reference_lla.json", b"{}".to_vec()),
+        ("reconstruction/reconstruction.json", stub::RECONSTRUCTION.as_bytes().to_vec()),
+        ("reconstruction/reference_lla.json", stub::REFERENCE.as_bytes().to_vec()),
     ] {
         let answer = client.put(format!("{base}{survey}/{path}")).body(body).send().unwrap();
         assert_eq!(answer.status(), StatusCode::CREATED);
@@ -267,10 +269,10 @@ fn a_broken_reconstruction_fails_its_job() {
     let (_, job) = broken_survey_with_job(&client, &base);
     let job = follow(&client, &base, &job);
     assert_eq!((&job["state"], &job["attempt"]), (&json!("failed"), &json!(1)), "{job}");
-    assert_eq!(job["error"]["code"], "reconstruction_malformed", "{job}");
+    assert_eq!(job["error"]["code"], "points_missing", "{job}");
     let message = job["error"]["message"].as_str().unwrap();
-    assert!(message.starts_with("reconstruction.json is not what OpenSfM writes"), "{message}");
-    assert!(message.ends_with("export it again"), "{message}");
+    assert!(message.contains("reconstruction.json: neither dense nor sparse points"), "{message}");
+    assert!(message.ends_with("run the reconstruction again"), "{message}");
 }
 
 #[test]

@@ -1,6 +1,7 @@
 //! GeoJSON (RFC 7946) of a plant model: one layer each for modules, sectors, benches and lines.
 
-use crate::geodesy::GeodeticReference;
+use crate::antimeridian;
+use crate::geodesy::{GeodeticReference, Lla};
 use crate::plant::{Module, PlantModel};
 use nalgebra::Vector3;
 use serde_json::{Map, Value, json};
@@ -143,13 +144,10 @@ impl PlantModel {
 
     /// One module as a polygon of its four corners.
     pub fn module_feature(&self, module: &Module) -> Value {
-        let position = |point: Vector3<f64>| position(&self.reference, point);
-        let mut ring: Vec<Value> = module.corners_enu_m.iter().map(|corner| position(*corner)).collect();
-        ring.push(ring[0].clone());
         json!({
             "type": "Feature",
             "id": module.id,
-            "geometry": {"type": "Polygon", "coordinates": [ring]},
+            "geometry": polygon(&self.reference, &module.corners_enu_m),
             "properties": {
                 "id": module.id,
                 "label": module.label,
@@ -159,7 +157,7 @@ impl PlantModel {
                 "sector": module.sector,
                 "row": module.row,
                 "number": module.number,
-                "center": position(module.center_enu_m),
+                "center": position(self.reference.lla_from_enu(module.center_enu_m)),
                 "tilt_deg": round(module.tilt_deg(), 3),
                 "azimuth_deg": round(module.azimuth_deg(), 3),
                 "width_m": round(module.width_m, 4),
@@ -178,15 +176,13 @@ impl PlantModel {
         properties["modules"] = json!(members.len());
         let geometry = match outline(members) {
             Some(outline) => {
-                let mut ring: Vec<Value> = outline.iter().map(|corner| position(&self.reference, *corner)).collect();
-                ring.push(ring[0].clone());
                 let center = outline.iter().sum::<Vector3<f64>>() / 4.0;
-                properties["center"] = position(&self.reference, center);
+                properties["center"] = position(self.reference.lla_from_enu(center));
                 let tilt = members.iter().map(|m| m.tilt_deg()).sum::<f64>() / members.len() as f64;
                 let normal = members.iter().map(|m| m.normal_enu).sum::<Vector3<f64>>();
                 properties["tilt_deg"] = json!(round(tilt, 3));
                 properties["azimuth_deg"] = json!(round(normal.x.atan2(normal.y).to_degrees().rem_euclid(360.0), 3));
-                json!({"type": "Polygon", "coordinates": [ring]})
+                polygon(&self.reference, &outline)
             }
             None => Value::Null,
         };
@@ -216,9 +212,26 @@ fn outline(members: &[&Module]) -> Option<[Vector3<f64>; 4]> {
     Some(corners)
 }
 
-/// Longitude, latitude (9 decimals, 0.1 mm) and height (0.1 mm) of a local point.
-fn position(reference: &GeodeticReference, enu_m: Vector3<f64>) -> Value {
-    let lla = reference.lla_from_enu(enu_m);
+/// A polygon by its corners in the local frame, metres; of several parts across the line of 180 degrees.
+fn polygon(reference: &GeodeticReference, corners_enu_m: &[Vector3<f64>]) -> Value {
+    let corners: Vec<Lla> = corners_enu_m.iter().map(|corner| reference.lla_from_enu(*corner)).collect();
+    let ring = |part: Vec<Lla>| {
+        let mut ring: Vec<Value> = part.into_iter().map(position).collect();
+        ring.extend(ring.first().cloned());
+        ring
+    };
+    let mut rings: Vec<Vec<Value>> = antimeridian::cut(&corners).into_iter().map(ring).collect();
+    match rings.len() {
+        1 => json!({"type": "Polygon", "coordinates": [rings.remove(0)]}),
+        _ => {
+            let parts: Vec<_> = rings.into_iter().map(|ring| [ring]).collect();
+            json!({"type": "MultiPolygon", "coordinates": parts})
+        }
+    }
+}
+
+/// Longitude, latitude (9 decimals, 0.1 mm) and height (0.1 mm).
+fn position(lla: Lla) -> Value {
     json!([round(lla.longitude_deg, 9), round(lla.latitude_deg, 9), round(lla.height_m, 4)])
 }
 

@@ -4,6 +4,7 @@
 //! stores it.
 
 pub mod alignment;
+mod antimeridian;
 pub mod geodesy;
 pub mod geojson;
 pub mod ids;

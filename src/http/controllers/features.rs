@@ -30,7 +30,8 @@ const CHUNK: u32 = 2_000;
 #[serde(deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub struct FeaturesQuery {
-    /// West, south, east, north, degrees: only features whose own box touches it.
+    /// West, south, east, north, degrees: only features whose own box touches it. Where west is more than east, the box
+    /// crosses the line of 180 degrees.
     #[param(example = "8.1,50.2,8.2,50.3")]
     pub bbox: Option<String>,
     /// Most features in the answer; without it, all of them.
@@ -56,9 +57,10 @@ impl FeaturesQuery {
         if min_lat > max_lat || min_lat < -90.0 || max_lat > 90.0 {
             return wrong("has latitudes that are none or the wrong way round");
         }
-        if min_lon > max_lon || min_lon < -180.0 || max_lon > 180.0 {
-            return wrong("has longitudes that are none or the wrong way round (ask for the two sides of 180° apart)");
+        if [min_lon, max_lon].iter().any(|lon| lon.abs() > 180.0) {
+            return wrong("has longitudes that are none");
         }
+        let max_lon = if min_lon > max_lon { max_lon + 360.0 } else { max_lon };
         Ok(Some(GeoBox { min_lon, min_lat, max_lon, max_lat }))
     }
 
@@ -124,7 +126,7 @@ pub async fn layer(
     features.truncate(limit as usize);
     let next = features.last().filter(|_| more).map(|last| {
         let place = format!("/api/v1/plants/{plant}/models/{}/{layer}", model.version);
-        let bbox = within.map(|b| format!("&bbox={},{},{},{}", b.min_lon, b.min_lat, b.max_lon, b.max_lat));
+        let bbox = query.bbox.as_ref().map(|bbox| format!("&bbox={}", bbox.replace(' ', "")));
         format!("{place}?limit={limit}&cursor={}{}", last.seq, bbox.unwrap_or_default())
     });
     members.insert("numberReturned".to_owned(), features.len().into());
@@ -300,7 +302,8 @@ struct GeoFeature {
     r#type: String,
     /// The global identifier.
     id: Uuid,
-    /// A polygon; positions are longitude, latitude and height.
+    /// A polygon, or across the line of 180 degrees its two parts (`MultiPolygon`); positions are longitude, latitude and
+    /// height.
     #[schema(example = json!({"type": "Polygon", "coordinates": [[[8.0, 50.0, 101.2], [8.00001, 50.0, 101.2], [8.00001, 50.00002, 102.0], [8.0, 50.00002, 102.0], [8.0, 50.0, 101.2]]]}))]
     geometry: Value,
     /// `id`, `label`, `plant`, the place in the plant (`line`, `bench`, `sector`, `row`, `number`), and what was measured:

@@ -8,8 +8,8 @@ use crate::http::error::{ApiError, Code, Problem};
 use crate::http::extract::ApiPath;
 use crate::http::middleware::conditional;
 use crate::http::state::AppState;
-use crate::http::uploads::intake::archive::{self, ArchiveError, Unpacked};
-use crate::http::uploads::intake::receive::{Bounds, drain, receive};
+use crate::http::uploads::intake::archive::{self, ArchiveError, LeftOut, Unpacked};
+use crate::http::uploads::intake::receive::{Bounds, drain, receive, waits_to_be_asked};
 use crate::http::uploads::intake::{self, Stored};
 use crate::store::{Content, FileWritten, ImageName, StagedFile, StoreError, SurveyId, SurveyPath};
 use axum::Json;
@@ -42,11 +42,13 @@ pub struct UploadedFiles {
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 pub struct UploadedArchive {
     pub files: Vec<UploadedFile>,
-    /// How many of its entries are no files of a survey; they were left out.
+    /// How many of its entries were not taken.
     pub ignored_count: usize,
     /// The first few of them.
     #[schema(example = json!(["odm_report/report.pdf"]))]
     pub ignored: Vec<String>,
+    /// All of them that look like a photo or a part of a reconstruction, with the reason.
+    pub left_out: Vec<LeftOut>,
 }
 
 /// A file that was stored, as it is told.
@@ -120,7 +122,8 @@ pub async fn put_image(
         (status = 200, description = "Replaced, or unchanged", body = UploadedFile, headers(("etag" = String))),
         (status = 412, description = "`precondition_failed`", body = Problem, content_type = "application/problem+json"),
         (status = "4XX", description = "`plant_not_found`, `survey_not_found`, `unknown_file`, `invalid_name`, `too_large`, \
-            `file_unreadable`, `image_too_large`, `image_format_mismatch`, `image_unreadable`, `image_truncated`, \
+            `file_unreadable`, `reconstruction_malformed`, `reconstruction_not_finite`, `camera_model_unknown`, \
+            `too_few_images`, `point_cloud_empty`, `point_cloud_truncated`, `point_cloud_too_large`, `boxes_invalid`, `image_too_large`, `image_format_mismatch`, `image_unreadable`, `image_truncated`, \
             `upload_interrupted`, `upload_stalled`, `bad_request`, `unsupported_media_type` (a coded body), \
             `checksum_mismatch`", body = Problem, content_type = "application/problem+json"),
         (status = 507, description = "`storage_full`, `quota_exceeded`", body = Problem, content_type = "application/problem+json")
@@ -145,6 +148,7 @@ async fn put_one(
     body: Body,
 ) -> Result<Response, ApiError> {
     let mut body = body.into_data_stream();
+    let mut is_asked_for = !waits_to_be_asked(headers);
     let stored = async {
         let place = place?;
         let wanted = conditional::wanted(headers);
@@ -157,10 +161,12 @@ async fn put_one(
         }
         let limit = match place.content() {
             Content::Image => state.limits.max_image_size,
-            Content::Json { .. } | Content::Ply => state.limits.max_file_size,
+            Content::Json { .. } | Content::Ply | Content::Text => state.limits.max_file_size,
         };
+        require_within(place.as_str(), limit, headers)?;
+        is_asked_for = true;
         let staged = receive_body(state, place.as_str(), limit, headers, &mut body).await?;
-        let checked = intake::check(state, place, staged).await?;
+        let checked = intake::check(state, plant, place, staged).await?;
         intake::store(state, plant, survey, vec![checked], wanted.as_ref()).await
     };
     match stored.await {
@@ -172,13 +178,24 @@ async fn put_one(
             Ok((status, tag, Json(file)).into_response())
         }
         Err(problem) => {
-            drain(&mut body, &problem).await;
+            if is_asked_for {
+                drain(&mut body, &problem).await;
+            }
             Err(problem)
         }
     }
 }
 
-/// Streams a whole body to disk; one that says that it is too large is refused before.
+/// Refuses a body that says that it is larger.
+fn require_within(name: &str, max_bytes: u64, headers: &HeaderMap) -> Result<(), ApiError> {
+    let announced = headers.get(header::CONTENT_LENGTH).and_then(|value| value.to_str().ok()?.parse::<u64>().ok());
+    match announced {
+        Some(length) if length > max_bytes => Err(intake::too_large(name, max_bytes)),
+        _ => Ok(()),
+    }
+}
+
+/// Streams a whole body to disk.
 async fn receive_body(
     state: &AppState,
     name: &str,
@@ -186,10 +203,6 @@ async fn receive_body(
     headers: &HeaderMap,
     body: &mut BodyDataStream,
 ) -> Result<StagedFile, ApiError> {
-    let announced = headers.get(header::CONTENT_LENGTH).and_then(|value| value.to_str().ok()?.parse::<u64>().ok());
-    if announced.is_some_and(|length| length > max_bytes) {
-        return Err(intake::too_large(name, max_bytes));
-    }
     let bounds = Bounds { name, max_bytes, idle: state.limits.request_timeout };
     let staged = receive(body, state.blobs.staging(), bounds).await?;
     intake::digest::require(headers, &staged.sha256)?;
@@ -253,7 +266,7 @@ pub async fn post_images(
             let place = SurveyPath::of_image(&ImageName::parse(&name)?);
             let bounds = Bounds { name: place.as_str(), max_bytes: state.limits.max_image_size, idle };
             let staged = receive(&mut part, state.blobs.staging(), bounds).await?;
-            let checked = intake::check(&state, place, staged).await?;
+            let checked = intake::check(&state, plant, place, staged).await?;
             intake::store(&state, plant, survey, vec![checked], None).await
         };
         match stored.await {
@@ -320,8 +333,9 @@ struct PhotoForm {
 
 /// Upload a reconstruction as one zip, tar or tar.gz
 ///
-/// The archive holds OpenSfM's folder or what is in it, photos included if you like. All of its known files are stored
-/// or, where one is refused, none; other files in it are ignored.
+/// The archive holds OpenSfM's folder or what is in it, or ODM's project, photos included if you like; photos may lie in
+/// folders below `images/`. All of its known files are stored or, where one is refused, none; of the others, `left_out`
+/// names those that look like a photo or a part of a reconstruction.
 #[utoipa::path(
     put,
     path = "/api/v1/plants/{plant}/surveys/{survey}/reconstruction",
@@ -335,7 +349,8 @@ struct PhotoForm {
     responses(
         (status = 200, description = "All stored", body = UploadedArchive),
         (status = "4XX", description = "`plant_not_found`, `survey_not_found`, `unsupported_archive`, `archive_unsafe`, \
-            `archive_unreadable`, `archive_empty`, `archive_too_large`, `too_large`, `invalid_name`, `file_unreadable`, \
+            `archive_unreadable`, `archive_empty`, `archive_too_large`, `too_large`, `invalid_name`, `file_unreadable`, `reconstruction_malformed`, `reconstruction_not_finite`, `camera_model_unknown`, \
+            `too_few_images`, `point_cloud_empty`, `point_cloud_truncated`, `point_cloud_too_large`, `boxes_invalid`, \
             `image_too_large`, `image_format_mismatch`, `image_unreadable`, `image_truncated`, `upload_interrupted`, \
             `upload_stalled`, `bad_request`, `unsupported_media_type` (a coded body), `checksum_mismatch`", body = Problem, content_type = "application/problem+json"),
         (status = 507, description = "`storage_full`, `quota_exceeded`", body = Problem, content_type = "application/problem+json")
@@ -348,14 +363,20 @@ pub async fn put_reconstruction(
     body: Body,
 ) -> Result<Json<UploadedArchive>, ApiError> {
     let mut body = body.into_data_stream();
+    let mut is_asked_for = !waits_to_be_asked(&headers);
     let stored = async {
         conditional::refuse(&headers, "an archive")?;
         state.require_survey(plant, survey).await?;
-        let archive = receive_body(&state, "the archive", state.limits.max_archive_size, &headers, &mut body).await?;
+        let limit = state.limits.max_archive_size;
+        require_within("the archive", limit, &headers)?;
+        is_asked_for = true;
+        let archive = receive_body(&state, "the archive", limit, &headers, &mut body).await?;
         store_archive(&state, plant, survey, archive).await.map(Json)
     };
     let stored: Result<_, ApiError> = stored.await;
-    if let Err(problem) = &stored {
+    if let Err(problem) = &stored
+        && is_asked_for
+    {
         drain(&mut body, problem).await;
     }
     stored
@@ -394,20 +415,20 @@ pub async fn store_archive(
     survey: SurveyId,
     archive: StagedFile,
 ) -> Result<UploadedArchive, ApiError> {
-    let Unpacked { files, ignored, ignored_count } = unpack(state, archive).await?;
+    let Unpacked { files, ignored, ignored_count, left_out } = unpack(state, archive).await?;
     let mut checked = Vec::with_capacity(files.len());
     for (place, staged) in files {
         let limit = match place.content() {
             Content::Image => state.limits.max_image_size,
-            Content::Json { .. } | Content::Ply => state.limits.max_file_size,
+            Content::Json { .. } | Content::Ply | Content::Text => state.limits.max_file_size,
         };
         if staged.size > limit {
             return Err(intake::too_large(place.as_str(), limit));
         }
-        checked.push(intake::check(state, place, staged).await?);
+        checked.push(intake::check(state, plant, place, staged).await?);
     }
     let files = intake::store(state, plant, survey, checked, None).await?.into_iter().map(uploaded).collect();
-    Ok(UploadedArchive { files, ignored_count, ignored })
+    Ok(UploadedArchive { files, ignored_count, ignored, left_out })
 }
 
 async fn unpack(state: &AppState, archive: StagedFile) -> Result<Unpacked, ApiError> {
@@ -418,7 +439,9 @@ async fn unpack(state: &AppState, archive: StagedFile) -> Result<Unpacked, ApiEr
         let code = match &error {
             ArchiveError::Unknown | ArchiveError::OtherKind { .. } => Code::UnsupportedArchive,
             ArchiveError::Unreadable(_) => Code::ArchiveUnreadable,
-            ArchiveError::Unsafe { .. } | ArchiveError::Twice { .. } => Code::ArchiveUnsafe,
+            ArchiveError::Unsafe { .. } | ArchiveError::Twice { .. } | ArchiveError::SameName { .. } => {
+                Code::ArchiveUnsafe
+            }
             ArchiveError::TooLarge { .. } => Code::ArchiveTooLarge,
             ArchiveError::Name { .. } => Code::InvalidName,
             ArchiveError::NothingKnown { .. } => Code::ArchiveEmpty,

@@ -6,7 +6,7 @@ use crate::http::extract::{ApiPath, ApiQuery};
 use crate::http::paging::{List, list_limit, next_part, prefix_filter, with_filters};
 use crate::http::state::AppState;
 use crate::http::uploads::intake;
-use crate::jobs;
+use crate::jobs::{self, ShotNames};
 use crate::store::{Digest, FileKind, FileRecord, SurveyId, SurveyPath};
 use axum::extract::State;
 use axum::http::header;
@@ -17,7 +17,7 @@ use heliomap_model::PlantId;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
-use std::collections::{BTreeSet, HashMap};
+use std::collections::HashMap;
 
 /// Photos per look into the store.
 const CHUNK: u32 = 1000;
@@ -255,7 +255,7 @@ struct Photos<'a> {
     state: &'a AppState,
     survey: SurveyId,
     alike: Alike,
-    shots: Option<BTreeSet<String>>,
+    shots: Option<ShotNames>,
 }
 
 impl<'a> Photos<'a> {
@@ -277,7 +277,7 @@ impl<'a> Photos<'a> {
         for file in self.state.store.photos(self.survey, name, after, limit).await? {
             let twins = self.alike.twins(&file);
             let name = file.path.file_name().to_owned();
-            let reconstructed = self.shots.as_ref().map(|shots| jobs::is_shot(shots, &name));
+            let reconstructed = self.shots.as_ref().map(|shots| shots.contains(&name));
             images.push(ImageView { name, reconstructed, file: FileView::new(file, &twins) });
         }
         Ok(images)
@@ -445,7 +445,7 @@ pub fn summary(files: Vec<FileRecord>) -> (ImagesSummary, Vec<FileView>) {
     let photo_names =
         |file: &FileRecord| (file.path.kind() == FileKind::Image).then(|| file.path.file_name().to_owned());
     let names: Vec<String> = files.iter().filter_map(photo_names).collect();
-    let shots: Option<BTreeSet<String>> = jobs::shots(&files).map(|shots| shots.iter().cloned().collect());
+    let shots: Option<ShotNames> = jobs::shots(&files).map(|shots| shots.iter().cloned().collect());
     let mut not_uploaded = jobs::shots_without_image(&files);
     let not_uploaded_count = not_uploaded.len();
     not_uploaded.truncate(MAX_NAMED);
@@ -460,7 +460,7 @@ pub fn summary(files: Vec<FileRecord>) -> (ImagesSummary, Vec<FileView>) {
     let views: Vec<FileView> = files.into_iter().map(view).collect();
     let uploaded = names.len();
     let mut not_reconstructed: Vec<String> = match &shots {
-        Some(shots) => names.into_iter().filter(|name| !jobs::is_shot(shots, name)).collect(),
+        Some(shots) => names.into_iter().filter(|name| !shots.contains(name)).collect(),
         None => Vec::new(),
     };
     let not_reconstructed_count = not_reconstructed.len();
@@ -469,7 +469,7 @@ pub fn summary(files: Vec<FileRecord>) -> (ImagesSummary, Vec<FileView>) {
         uploaded,
         with_position,
         with_warning: views.iter().filter(|view| !view.warnings.is_empty()).count(),
-        reconstructed: shots.as_ref().map(BTreeSet::len),
+        reconstructed: shots.as_ref().map(ShotNames::count),
         not_reconstructed,
         not_reconstructed_count,
         not_uploaded,

@@ -197,7 +197,7 @@ pub async fn create(
     let secret = new_secret()?;
     let new = NewKey {
         organisation: caller.organisation,
-        name: checked_name(&asked.name)?.to_owned(),
+        name: checked_name(&asked.name)?,
         secret: secret.record(),
         scopes: asked.scopes,
         plants: asked.plants,

@@ -42,7 +42,7 @@ impl From<Plant> for PlantView {
 }
 
 /// Reads a name that people give.
-pub fn checked_name(name: &str) -> Result<&str, ApiError> {
+pub fn checked_name(name: &str) -> Result<String, ApiError> {
     name::checked(name).map_err(|error| ApiError::new(Code::InvalidName, error.to_string()))
 }
 
@@ -87,14 +87,14 @@ pub async fn create(
     let name = checked_name(&new.name)?;
     if let Some(plants) = &caller.plants {
         let page = Page { after: None, limit: plants.len() as u32 };
-        let plants = state.store.plants(caller.organisation, Some(plants), name, page).await?;
+        let plants = state.store.plants(caller.organisation, Some(plants), &name, page).await?;
         if let Some(plant) = plants.into_iter().find(|plant| plant.name == name) {
             return Ok(created_answer(format!("/api/v1/plants/{}", plant.id), false, PlantView::from(plant)));
         }
     }
     caller.require_all_plants()?;
     let quotas = state.limits.quotas();
-    let (plant, new) = match state.store.create_plant(caller.organisation, name, quotas, Timestamp::now()).await? {
+    let (plant, new) = match state.store.create_plant(caller.organisation, &name, quotas, Timestamp::now()).await? {
         Created::New(plant) => (plant, true),
         Created::Existing(plant) => (plant, false),
     };

@@ -171,7 +171,7 @@ pub async fn create(
 ) -> Result<Response, ApiError> {
     let name = checked_name(&new.name)?;
     state.require_plant(plant).await?;
-    let (survey, new) = match state.store.create_survey(plant, name, Timestamp::now()).await? {
+    let (survey, new) = match state.store.create_survey(plant, &name, Timestamp::now()).await? {
         Created::New(survey) => (survey, true),
         Created::Existing(survey) => (survey, false),
     };

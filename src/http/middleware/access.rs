@@ -4,7 +4,7 @@
 use crate::http::error::{ApiError, Code};
 use crate::http::server::Peer;
 use crate::http::state::AppState;
-use crate::http::uploads::intake::receive::drain;
+use crate::http::uploads::intake::receive::{drain, waits_to_be_asked};
 use crate::oidc::{Oidc, OidcError};
 use crate::store::{ApiKey, AuditEntry, Digest, KeyId, OrganisationId, Scope};
 use axum::extract::{FromRequestParts, MatchedPath, RawPathParams, Request, State};
@@ -360,9 +360,12 @@ fn client_address(request: &Request, behind_proxy: bool) -> Option<IpAddr> {
     if behind_proxy { told.or(peer) } else { peer }
 }
 
-/// Answers a problem, once what the client is sending was taken off the line within reason.
+/// Answers a problem, once what the client is sending was taken off the line within reason; one that waits to be asked is
+/// not.
 pub async fn refuse(request: Request, problem: ApiError) -> Response {
-    drain(request.into_body().into_data_stream(), &problem).await;
+    if !waits_to_be_asked(request.headers()) {
+        drain(request.into_body().into_data_stream(), &problem).await;
+    }
     let challenge = (problem.code == Code::Unauthorized).then_some([(header::WWW_AUTHENTICATE, "Bearer")]);
     (challenge, problem).into_response()
 }

@@ -6,7 +6,7 @@ use crate::http::error::{ApiError, Code};
 use crate::http::middleware::access::refuse;
 use axum::extract::{Request, State};
 use axum::http::uri::Authority;
-use axum::http::{HeaderMap, Method, header};
+use axum::http::{HeaderMap, HeaderValue, Method, header};
 use axum::middleware::Next;
 use axum::response::Response;
 use std::net::IpAddr;
@@ -26,8 +26,12 @@ pub async fn only(State(network): State<Arc<NetworkArgs>>, request: Request, nex
 
 /// Whether the host that a request names is this machine. One that names none comes from no browser.
 fn names_this_machine(headers: &HeaderMap) -> bool {
-    let Some(host) = headers.get(header::HOST) else { return true };
-    let Ok(authority) = Authority::try_from(host.as_bytes()) else { return false };
+    headers.get(header::HOST).is_none_or(|host| is_this_machine(host.as_bytes()))
+}
+
+/// Whether a host, perhaps with a port, is this machine.
+fn is_this_machine(host: &[u8]) -> bool {
+    let Ok(authority) = Authority::try_from(host) else { return false };
     let host = authority.host().trim_start_matches('[').trim_end_matches(']').to_ascii_lowercase();
     let by_name = host == "localhost" || host.ends_with(".localhost");
     by_name || host.parse::<IpAddr>().is_ok_and(|address| address.is_loopback())
@@ -37,16 +41,23 @@ fn changes(method: &Method) -> bool {
     !matches!(*method, Method::GET | Method::HEAD | Method::OPTIONS)
 }
 
-/// Whether a browser says that a page of another site sends a request, and not one that is let in.
+/// Whether a browser says that a page of another site sends a request, and not one that is let in. Old ones tell the page's
+/// origin alone.
 fn is_cross_site(headers: &HeaderMap, network: &NetworkArgs) -> bool {
-    let elsewhere = headers.get("sec-fetch-site").is_some_and(|site| site == "cross-site");
-    elsewhere && !headers.get(header::ORIGIN).is_some_and(|origin| network.cors_origin.contains(origin))
+    let origin = headers.get(header::ORIGIN);
+    if origin.is_some_and(|origin| network.cors_origin.contains(origin)) {
+        return false;
+    }
+    let elsewhere = |origin: &HeaderValue| {
+        let host = origin.as_bytes().splitn(3, |byte| *byte == b'/').nth(2);
+        !host.is_some_and(is_this_machine)
+    };
+    headers.get("sec-fetch-site").is_some_and(|site| site == "cross-site") || origin.is_some_and(elsewhere)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use axum::http::HeaderValue;
 
     #[test]
     fn hosts() {
@@ -64,5 +75,21 @@ mod tests {
             assert!(!names(host), "{host}");
         }
         assert!(names_this_machine(&HeaderMap::new()));
+    }
+
+    #[test]
+    fn origins() {
+        let network = NetworkArgs::default();
+        for (origin, elsewhere) in [
+            ("http://localhost:5173", false),
+            ("http://127.0.0.1:8080", false),
+            ("https://evil.example", true),
+            ("http://localhost.evil.example", true),
+            ("null", true),
+            ("", true),
+        ] {
+            let headers = HeaderMap::from_iter([(header::ORIGIN, HeaderValue::from_static(origin))]);
+            assert_eq!(is_cross_site(&headers, &network), elsewhere, "{origin}");
+        }
     }
 }

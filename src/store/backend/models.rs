@@ -13,6 +13,7 @@ use async_trait::async_trait;
 use heliomap_model::{Layer, ModuleId, PlantId};
 use jiff::Timestamp;
 use sqlx::{QueryBuilder, Row as _};
+use std::collections::BTreeMap;
 
 macro_rules! model_columns {
     () => {
@@ -81,6 +82,34 @@ impl ModelStore for Rows {
     }
 
     async fn features(&self, layer: &LayerInfo, page: FeatureQuery) -> Result<Vec<Feature>, StoreError> {
+        let Some(within) = page.within else { return self.features_at(layer, page).await };
+        let mut found: BTreeMap<i64, Feature> = BTreeMap::new();
+        for turned in within.turns(layer.widest_deg) {
+            let part = self.features_at(layer, FeatureQuery { within: Some(turned), ..page }).await?;
+            found.extend(part.into_iter().map(|feature| (feature.seq, feature)));
+        }
+        Ok(found.into_values().take(page.limit as usize).collect())
+    }
+
+    async fn module(&self, model: &Model, id: ModuleId) -> Result<Option<String>, StoreError> {
+        const MODULE: &str = "SELECT feature FROM features WHERE id = $1 AND model_seq = $2 AND layer = 'modules'";
+        let query = sqlx::query_scalar(MODULE).bind(id.to_string()).bind(model.seq);
+        Ok(query.fetch_optional(&self.read).await?)
+    }
+
+    async fn module_last_seen(&self, plant: PlantId, id: ModuleId) -> Result<Option<u32>, StoreError> {
+        const MODULE_LAST_SEEN: &str = "\
+            SELECT models.version FROM features JOIN models ON models.seq = features.model_seq \
+            WHERE features.id = $1 AND features.layer = 'modules' AND models.plant_id = $2 ORDER BY models.version DESC LIMIT 1";
+        let query = sqlx::query_scalar(MODULE_LAST_SEEN).bind(id.to_string()).bind(plant.to_string());
+        let version: Option<i64> = query.fetch_optional(&self.read).await?;
+        version.map(|version| small("version", version)).transpose()
+    }
+}
+
+impl Rows {
+    /// Features of a layer, of those with longitudes as they are stored.
+    async fn features_at(&self, layer: &LayerInfo, page: FeatureQuery) -> Result<Vec<Feature>, StoreError> {
         const FEATURES: &str = "\
             SELECT seq, feature FROM features WHERE model_seq = $1 AND layer = $2 AND seq > $3 ORDER BY seq LIMIT $4";
         /// A box that covers little of the layer: in each strip from `$10` to `$11` take the latitudes from the index by place (which
@@ -125,21 +154,6 @@ impl ModelStore for Rows {
         }
         let rows = query.fetch_all(&self.read).await?;
         rows.iter().map(|row| Ok(Feature { seq: row.try_get("seq")?, json: row.try_get("feature")? })).collect()
-    }
-
-    async fn module(&self, model: &Model, id: ModuleId) -> Result<Option<String>, StoreError> {
-        const MODULE: &str = "SELECT feature FROM features WHERE id = $1 AND model_seq = $2 AND layer = 'modules'";
-        let query = sqlx::query_scalar(MODULE).bind(id.to_string()).bind(model.seq);
-        Ok(query.fetch_optional(&self.read).await?)
-    }
-
-    async fn module_last_seen(&self, plant: PlantId, id: ModuleId) -> Result<Option<u32>, StoreError> {
-        const MODULE_LAST_SEEN: &str = "\
-            SELECT models.version FROM features JOIN models ON models.seq = features.model_seq \
-            WHERE features.id = $1 AND features.layer = 'modules' AND models.plant_id = $2 ORDER BY models.version DESC LIMIT 1";
-        let query = sqlx::query_scalar(MODULE_LAST_SEEN).bind(id.to_string()).bind(plant.to_string());
-        let version: Option<i64> = query.fetch_optional(&self.read).await?;
-        version.map(|version| small("version", version)).transpose()
     }
 }
 

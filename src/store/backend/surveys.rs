@@ -234,7 +234,7 @@ fn survey(row: &Row) -> Result<Survey, StoreError> {
 
 fn path(row: &Row) -> Result<SurveyPath, StoreError> {
     let path: String = row.try_get("path")?;
-    SurveyPath::parse(&path).map_err(|_| StoreError::Corrupt { what: "path of a file", value: path })
+    SurveyPath::stored(path.clone()).map_err(|_| StoreError::Corrupt { what: "path of a file", value: path })
 }
 
 fn digest_and_path(row: &Row) -> Result<(Digest, SurveyPath), StoreError> {

@@ -26,6 +26,9 @@ impl From<io::Error> for JpegError {
     }
 }
 
+/// Most scans of a picture: each is decoded over all of it. Programs that write progressive pictures make 6 to 14.
+const MAX_SCANS: u32 = 32;
+
 const START_OF_IMAGE: u8 = 0xd8;
 const END_OF_IMAGE: u8 = 0xd9;
 const START_OF_SCAN: u8 = 0xda;
@@ -80,6 +83,9 @@ pub fn walk(file: impl BufRead, limit: impl Fn([u32; 2]) -> bool) -> Result<Stru
         }
         let in_scan = marker == START_OF_SCAN;
         scans += u32::from(in_scan);
+        if scans > MAX_SCANS {
+            return Err(JpegError::Malformed("it is in more than 32 scans, which no camera writes"));
+        }
         let next = next_marker(&mut file, in_scan)?;
         if !is_metadata(marker) {
             keep(from, file.at - 2)?;
@@ -216,6 +222,16 @@ mod tests {
         for end in 0..bytes.len() {
             assert!(walk(&bytes[..end], |_| true).is_err(), "cut at {end} of {}", bytes.len());
         }
+    }
+
+    #[test]
+    fn pictures_of_very_many_scans_are_refused() {
+        let bytes = jpeg();
+        let scan = bytes.windows(2).position(|pair| pair == [0xff, START_OF_SCAN]).unwrap();
+        let (head, data) = bytes[..bytes.len() - 2].split_at(scan);
+        let of = |scans: usize| [head, &data.repeat(scans), &[0xff, END_OF_IMAGE]].concat();
+        assert!(walk(&of(MAX_SCANS as usize)[..], |_| true).is_ok());
+        assert!(matches!(walk(&of(MAX_SCANS as usize + 1)[..], |_| true), Err(JpegError::Malformed(_))));
     }
 
     #[test]

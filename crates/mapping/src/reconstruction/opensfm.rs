@@ -1,6 +1,7 @@
 //! Reads what OpenSfM leaves in its project folder, and the project folder of ODM, which holds that of OpenSfM.
 
 mod cameras;
+pub mod check;
 mod frame;
 mod json;
 mod photos;
@@ -259,6 +260,11 @@ fn read_reference(
     } else {
         return Err(ReconstructionError::Missing { path: path.to_owned() });
     };
+    place_on_earth(entry, path)
+}
+
+/// The reference that `entry` of the file at `path` names.
+fn place_on_earth(entry: ReferenceEntry, path: PathBuf) -> Result<GeodeticReference, ReconstructionError> {
     let finite = [entry.latitude, entry.longitude, entry.altitude].iter().all(|value| value.is_finite());
     if !finite || entry.latitude.abs() > 90.0 || entry.longitude.abs() > 360.0 || entry.altitude.abs() > 1e5 {
         return Err(ReconstructionError::Malformed { path, what: "its reference is no place on earth".to_owned() });

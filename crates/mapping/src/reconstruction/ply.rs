@@ -26,34 +26,63 @@ const MAX_WORD_BYTES: usize = 400;
 /// # Errors
 /// An empty cloud, fewer points than promised, more than can be held, or a header that is not PLY.
 pub fn read(path: &Path) -> Result<PointCloud, ReconstructionError> {
-    let unreadable = |source| ReconstructionError::Unreadable { path: path.to_owned(), source };
-    let file = File::open(path).map_err(unreadable)?;
-    let file_bytes = file.metadata().map_err(unreadable)?.len();
-    let mut reader = BufReader::with_capacity(1 << 20, file);
-    let header = read_header(path, &mut reader)?;
-    check_size(path, &header, file_bytes)?;
-    let mut thinning = ThinningCloud::new(MAX_KEPT, header.vertex.count as usize);
-    let mut push = |position: [f32; 3]| {
-        if position.iter().all(|value| value.is_finite()) {
-            thinning.push(position);
-        }
-    };
-    match header.encoding {
-        Encoding::Ascii => read_records(path, &mut Words { reader }, &header, &mut push)?,
-        encoding => {
-            let mut fields = Fields { reader, big_endian: encoding == Encoding::BigEndian };
-            if header.vertex.record_bytes().is_some() && header.before.is_empty() {
-                fields.read_fixed(path, &header, &mut push)?;
-            } else {
-                read_records(path, &mut fields, &header, &mut push)?;
-            }
-        }
-    }
+    let mut open = Open::new(path)?;
+    let mut thinning = ThinningCloud::new(MAX_KEPT, open.header.vertex.count as usize);
+    open.each(&mut |position| thinning.push(position))?;
     let (cloud, _) = thinning.finish();
     if cloud.positions_m.is_empty() {
         return Err(ReconstructionError::EmptyCloud { path: path.to_owned() });
     }
     Ok(cloud)
+}
+
+/// Reads a PLY file through as [`read`] does, and keeps nothing.
+///
+/// # Errors
+/// Those of [`read`].
+pub fn check(path: &Path) -> Result<(), ReconstructionError> {
+    let mut points = 0_u64;
+    Open::new(path)?.each(&mut |_| points += 1)?;
+    if points == 0 { Err(ReconstructionError::EmptyCloud { path: path.to_owned() }) } else { Ok(()) }
+}
+
+/// A file whose header is read.
+struct Open<'a> {
+    path: &'a Path,
+    reader: BufReader<File>,
+    header: Header,
+}
+
+impl<'a> Open<'a> {
+    fn new(path: &'a Path) -> Result<Self, ReconstructionError> {
+        let unreadable = |source| ReconstructionError::Unreadable { path: path.to_owned(), source };
+        let file = File::open(path).map_err(unreadable)?;
+        let file_bytes = file.metadata().map_err(unreadable)?.len();
+        let mut reader = BufReader::with_capacity(1 << 20, file);
+        let header = read_header(path, &mut reader)?;
+        check_size(path, &header, file_bytes)?;
+        Ok(Self { path, reader, header })
+    }
+
+    /// Gives every vertex whose coordinates are finite.
+    fn each(&mut self, take: &mut dyn FnMut([f32; 3])) -> Result<(), ReconstructionError> {
+        let Self { path, reader, header } = self;
+        let mut push = |position: [f32; 3]| {
+            if position.iter().all(|value| value.is_finite()) {
+                take(position);
+            }
+        };
+        if header.encoding == Encoding::Ascii {
+            return read_records(path, &mut Words { reader }, header, &mut push);
+        }
+        let big_endian = header.encoding == Encoding::BigEndian;
+        let mut fields = Fields { reader, big_endian };
+        if header.vertex.record_bytes().is_some() && header.before.is_empty() {
+            fields.read_fixed(path, header, &mut push)
+        } else {
+            read_records(path, &mut fields, header, &mut push)
+        }
+    }
 }
 
 /// Refuses a header that promises nothing, more than is read, or more than the file holds.

@@ -1,11 +1,15 @@
 //! Zip and tar archives from people one does not know: every entry is looked at before the first is unpacked, and no
 //! entry decides where anything is written.
 
+mod places;
+
 use crate::config::Limits;
-use crate::store::{Digest, InvalidPath, StagedFile, SurveyPath, keep_free};
+use crate::store::{Digest, StagedFile, SurveyPath, keep_free};
+pub use places::LeftOut;
+use places::{Places, places};
 use sha2::Digest as _;
 use std::cell::Cell;
-use std::collections::BTreeMap;
+use std::collections::BTreeSet;
 use std::fs::File;
 use std::io::{self, BufReader, BufWriter, Read, Seek, SeekFrom, Write};
 use std::path::Path;
@@ -51,8 +55,10 @@ pub enum ArchiveError {
     TooLarge { what: String },
     #[error("the entry `{entry}` cannot be placed in a survey: {reason}")]
     Name { entry: String, reason: &'static str },
-    #[error("two entries are both {path}; leave one of them out")]
-    Twice { path: SurveyPath },
+    #[error("the entries `{first}` and `{second}` would both be {path}; leave one of them out")]
+    Twice { path: SurveyPath, first: String, second: String },
+    #[error("two entries are named `{entry}`; leave one of them out")]
+    SameName { entry: String },
     #[error(
         "none of its {entries} entries is a file of a reconstruction; expected are reconstruction.json, \
          reference_lla.json, undistorted/… and images/… as OpenSfM leaves them"
@@ -67,9 +73,11 @@ pub enum ArchiveError {
 #[derive(Debug)]
 pub struct Unpacked {
     pub files: Vec<(SurveyPath, StagedFile)>,
-    /// Entries that belong to no survey, the first few by name.
+    /// Entries that were not taken, the first few by name.
     pub ignored: Vec<String>,
     pub ignored_count: usize,
+    /// Those of them that look like a photo or a part of a reconstruction, all, with the reason.
+    pub left_out: Vec<LeftOut>,
 }
 
 /// Unpacks the files of a survey from an archive into files of their own in `folder`.
@@ -83,15 +91,15 @@ pub fn unpack(archive: &Path, folder: &Path, limits: &Limits) -> Result<Unpacked
         names.push(name.to_owned());
         Ok(())
     })?;
-    let places = places(&names)?;
-    if places.is_empty() {
+    let Places { taken, left_out } = places(&names)?;
+    if taken.is_empty() {
         return Err(ArchiveError::NothingKnown { entries: names.len() });
     }
-    let mut unpacked = Unpacked { files: Vec::new(), ignored: Vec::new(), ignored_count: 0 };
+    let mut unpacked = Unpacked { files: Vec::new(), ignored: Vec::new(), ignored_count: 0, left_out };
     let mut disk = Disk { folder, reserve: limits.disk_reserve, since: 0 };
     let mut index = 0;
     reader.each(&mut |name, content| {
-        match places.get(&index) {
+        match taken.get(&index) {
             Some(place) => unpacked.files.push((place.clone(), disk.stage(content)?)),
             None => {
                 // What is ignored is read as well: its checksum may tell that the archive came changed.
@@ -106,46 +114,6 @@ pub fn unpack(archive: &Path, folder: &Path, limits: &Limits) -> Result<Unpacked
         Ok(())
     })?;
     Ok(unpacked)
-}
-
-/// Which entries are files of a survey, by their index. An archive may hold the folder itself or what is in it, so a
-/// folder above the known paths is passed over; where there are several, the one nearest the top counts.
-fn places(names: &[String]) -> Result<BTreeMap<usize, SurveyPath>, ArchiveError> {
-    let mut found: Vec<(&str, usize, SurveyPath)> = Vec::new();
-    for (index, name) in names.iter().enumerate() {
-        let starts = std::iter::once(0).chain(name.match_indices('/').map(|(at, _)| at + 1));
-        for start in starts {
-            match SurveyPath::parse(&name[start..]) {
-                Ok(place) => {
-                    found.push((&name[..start], index, place));
-                    break;
-                }
-                // A photo whose name cannot be used: say so rather than leave it out.
-                Err(InvalidPath::Name { name: photo, reason }) if !photo.contains('/') && looks_like_photo(&photo) => {
-                    return Err(ArchiveError::Name { entry: shown(name), reason });
-                }
-                Err(_) => {}
-            }
-        }
-    }
-    let Some(base) = found.iter().map(|(base, ..)| *base).min_by_key(|base| (base.matches('/').count(), *base)) else {
-        return Ok(BTreeMap::new());
-    };
-    let mut places = BTreeMap::new();
-    let mut taken = std::collections::BTreeSet::new();
-    for (_, index, place) in found.iter().filter(|(prefix, ..)| *prefix == base) {
-        if !taken.insert(place) {
-            return Err(ArchiveError::Twice { path: place.clone() });
-        }
-        places.insert(*index, place.clone());
-    }
-    Ok(places)
-}
-
-/// Whether a file has an image's ending and is none of the hidden files that systems put beside photos.
-fn looks_like_photo(name: &str) -> bool {
-    let name = name.to_ascii_lowercase();
-    !name.starts_with('.') && [".jpg", ".jpeg", ".png", ".tif", ".tiff"].iter().any(|ending| name.ends_with(ending))
 }
 
 /// What is done with the name and the bytes of each regular file.
@@ -192,6 +160,7 @@ impl Reader<'_> {
             return Err(ArchiveError::Unreadable("bytes that belong to no entry stand before its first".to_owned()));
         }
         require_zip_end(self.file, archive.comment().len())?;
+        require_each_once(self.file, archive.central_directory_start(), archive.len())?;
         if archive.len() > self.max_entries {
             return Err(self.too_many());
         }
@@ -200,10 +169,11 @@ impl Reader<'_> {
             let mut entry = archive.by_index(index).map_err(zip_error)?;
             let name = entry.name().map_err(zip_error)?.into_owned();
             check_name(&name)?;
+            let name = with_slashes(name);
             if entry.is_symlink() {
                 return Err(unsafe_entry(&name, "is a link"));
             }
-            if entry.is_dir() {
+            if entry.is_dir() || name.ends_with('/') {
                 continue;
             }
             if entry.encrypted() {
@@ -278,6 +248,7 @@ impl Reader<'_> {
             return Ok(());
         }
         check_name(&name)?;
+        let name = with_slashes(name);
         if kind.is_symlink() || kind.is_hard_link() {
             return Err(unsafe_entry(&name, "is a link"));
         }
@@ -309,6 +280,11 @@ fn check_name(name: &str) -> Result<(), ArchiveError> {
         return Err(unsafe_entry(name, "has `..` in its path"));
     }
     Ok(())
+}
+
+/// A name with `/` between its parts, where a program of Windows put `\`.
+fn with_slashes(name: String) -> String {
+    if name.contains('\\') { name.replace('\\', "/") } else { name }
 }
 
 fn unsafe_entry(name: &str, what: &'static str) -> ArchiveError {
@@ -356,6 +332,29 @@ fn require_zip_end(file: &Path, comment_bytes: usize) -> Result<(), ArchiveError
         record.get(length_at..length_at + 2).map(|bytes| usize::from(u16::from_le_bytes([bytes[0], bytes[1]])));
     if !record.starts_with(signature) || length != Some(comment_bytes) {
         return Err(ArchiveError::Unreadable("bytes follow its end, as where two archives were joined".to_owned()));
+    }
+    Ok(())
+}
+
+/// Fails where several entries in the directory of a zip have one name, of which the reader has kept `count` names.
+fn require_each_once(file: &Path, start: u64, count: usize) -> Result<(), ArchiveError> {
+    /// Signature and length of a record less its texts, and where in it their lengths are (APPNOTE.TXT 4.3.12).
+    const RECORD: (&[u8], usize, [usize; 3]) = (b"PK\x01\x02", 46, [28, 30, 32]);
+    let (signature, record_bytes, lengths_at) = RECORD;
+    let mut file = BufReader::new(File::open(file).map_err(ArchiveError::Disk)?);
+    file.seek(SeekFrom::Start(start)).map_err(ArchiveError::Disk)?;
+    let mut names: BTreeSet<Vec<u8>> = BTreeSet::new();
+    let mut record = vec![0; record_bytes];
+    // One more than the names that are known tells that one is there twice.
+    while names.len() <= count && file.read_exact(&mut record).is_ok() && record.starts_with(signature) {
+        let [name, extra, comment] = lengths_at.map(|at| usize::from(u16::from_le_bytes([record[at], record[at + 1]])));
+        let mut text = vec![0; name];
+        file.read_exact(&mut text).map_err(read_error)?;
+        file.seek_relative((extra + comment) as i64).map_err(ArchiveError::Disk)?;
+        if names.contains(&text) {
+            return Err(ArchiveError::SameName { entry: shown(&String::from_utf8_lossy(&text)) });
+        }
+        names.insert(text);
     }
     Ok(())
 }

@@ -1,16 +1,25 @@
 //! Whether a file holds what its name says.
 
 use super::disk;
-use super::shots::{self, Shots};
 use crate::config::Limits;
 use crate::http::error::{ApiError, Code};
 use crate::store::{Content, FileKind, SurveyPath};
-use heliomap_mapping::reconstruction::PhotoFacts;
+use heliomap_mapping::detection::external;
+use heliomap_mapping::reconstruction::opensfm::check;
 use heliomap_mapping::reconstruction::photo::{self, PhotoError};
-use serde::de::IgnoredAny;
+use heliomap_mapping::reconstruction::{PhotoFacts, ReconstructionError, ply};
+use std::collections::BTreeSet;
 use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::Path;
+use unicode_normalization::UnicodeNormalization;
+
+/// Fewest images that a plant can be mapped from.
+const MIN_SHOTS: usize = 2;
+/// Most bytes of a file of text: ODM's has a few lines.
+const MAX_TEXT_BYTES: u64 = 64 << 10;
+/// Most bytes of an object that no job reads.
+const MAX_OBJECT_BYTES: u64 = 16 << 20;
 
 /// What was found in a file.
 #[derive(Debug, Default)]
@@ -27,8 +36,7 @@ pub struct Found {
 pub fn check(file: &Path, place: &SurveyPath, limits: &Limits) -> Result<Found, ApiError> {
     match place.content() {
         Content::Image => image(file, place, limits),
-        Content::Json { array } => Ok(Found { shots: json(file, place, array)?, ..Found::default() }),
-        Content::Ply => ply(file, place).map(|()| Found::default()),
+        Content::Json { .. } | Content::Ply | Content::Text => reconstruction(file, place),
     }
 }
 
@@ -64,47 +72,59 @@ fn image(file: &Path, place: &SurveyPath, limits: &Limits) -> Result<Found, ApiE
     }
 }
 
-/// Checks a document; the images that it names, where it is a reconstruction whose shots could be read.
-fn json(file: &Path, place: &SurveyPath, array: bool) -> Result<Option<Vec<String>>, ApiError> {
-    let wrong = |what: &str| {
-        ApiError::new(
-            Code::FileUnreadable,
-            format!("{place} {what}; send the file as OpenSfM wrote it, after its run ended without an error"),
-        )
+/// Checks a part of a reconstruction as the job that reads it would.
+fn reconstruction(file: &Path, place: &SurveyPath) -> Result<Found, ApiError> {
+    let refused = |error: ReconstructionError| {
+        let code = Code::of_word(error.code()).unwrap_or(Code::FileUnreadable);
+        (code, error.to_string())
     };
-    let open = || File::open(file).map(BufReader::new).map_err(|error| disk(file, error));
-    let first = open()?.bytes().map_while(Result::ok).find(|byte| !byte.is_ascii_whitespace());
-    match (first, array) {
-        (None, _) => return Err(wrong("is empty")),
-        (Some(b'['), true) | (Some(b'{'), false) => {}
-        (_, true) => return Err(wrong("is no JSON array of reconstructions")),
-        (_, false) => return Err(wrong("is no JSON object")),
-    }
-    if array {
-        match shots::read(open()?) {
-            Shots::Named(names) => return Ok(Some(names.into_iter().collect())),
-            Shots::TooMany => return Err(wrong(&format!("names more than {} images", shots::MAX_SHOTS))),
-            Shots::Unknown => {}
+    let checked = match place.as_str() {
+        "reconstruction.json" | "reconstruction.topocentric.json" => {
+            check::reconstruction(file, MIN_SHOTS).map(Some).map_err(refused)
         }
-    }
-    let document: Result<IgnoredAny, _> = serde_json::from_reader(open()?);
-    match document {
-        Ok(_) => Ok(None),
-        Err(error) if error.is_io() => Err(disk(file, error.into())),
-        Err(error) if error.is_eof() => Err(wrong("is cut short")),
-        Err(error) => Err(wrong(&format!("is no valid JSON: {error} (NaN and Infinity are none)"))),
+        "undistorted/reconstruction.json" => check::reconstruction(file, 0).map(Some).map_err(refused),
+        "reference_lla.json" => check::reference(file).map(|()| None).map_err(refused),
+        "undistorted/undistorted_shot_ids.json" => check::undistorted_names(file).map(|()| None).map_err(refused),
+        "boxes.json" => external::read(file).map(|_| None).map_err(|error| (Code::BoxesInvalid, error.to_string())),
+        _ => match place.content() {
+            Content::Ply => ply::check(file).map(|()| None).map_err(refused),
+            Content::Text => text(file).map(|()| None),
+            _ => object(file).map(|()| None),
+        },
+    };
+    match checked {
+        Ok(names) => {
+            let composed = |names: BTreeSet<String>| names.iter().map(|name| name.nfc().collect()).collect();
+            Ok(Found { shots: names.map(composed), ..Found::default() })
+        }
+        // Files have their places for names, wherever they lie.
+        Err((code, what)) => {
+            let name = file.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+            let what = what.replace(&*file.to_string_lossy(), place.as_str()).replace(&name, place.file_name());
+            Err(ApiError::new(code, what))
+        }
     }
 }
 
-fn ply(file: &Path, place: &SurveyPath) -> Result<(), ApiError> {
-    let mut head = [0; 4];
-    let begun = File::open(file).and_then(|mut file| file.read_exact(&mut head));
-    match begun {
-        Ok(()) if head.starts_with(b"ply") && head[3].is_ascii_whitespace() => Ok(()),
-        Err(error) if error.kind() != std::io::ErrorKind::UnexpectedEof => Err(disk(file, error)),
-        _ => Err(ApiError::new(
-            Code::FileUnreadable,
-            format!("{place} is no PLY point cloud; send undistorted/depthmaps/merged.ply as OpenSfM wrote it"),
-        )),
+/// A JSON object that no job reads.
+fn object(file: &Path) -> Result<(), (Code, String)> {
+    let wrong = |what: String| {
+        let name = file.display();
+        (Code::FileUnreadable, format!("{name} {what}; send the file as OpenSfM wrote it"))
+    };
+    let reader = File::open(file)
+        .map(|file| BufReader::new(file.take(MAX_OBJECT_BYTES)))
+        .map_err(|error| wrong(format!("cannot be read: {error}")))?;
+    let document: Result<serde_json::Map<String, serde_json::Value>, _> = serde_json::from_reader(reader);
+    document.map(drop).map_err(|error| wrong(format!("is no JSON object: {error}")))
+}
+
+/// A few lines of text.
+fn text(file: &Path) -> Result<(), (Code, String)> {
+    let mut start = Vec::new();
+    let read = File::open(file).and_then(|file| file.take(MAX_TEXT_BYTES).read_to_end(&mut start));
+    match read {
+        Ok(count) if (count as u64) < MAX_TEXT_BYTES && std::str::from_utf8(&start).is_ok() => Ok(()),
+        _ => Err((Code::FileUnreadable, format!("{} is no text as ODM writes it", file.display()))),
     }
 }

@@ -4,15 +4,12 @@ pub mod archive;
 pub mod content;
 pub mod digest;
 pub mod receive;
-mod shots;
 
 use crate::http::error::{ApiError, Code};
 use crate::http::middleware::conditional;
 use crate::http::state::AppState;
 use crate::store::freeing::free_abandoned;
-use crate::store::{
-    Content, Digest, FileKind, FileRecord, FileWritten, StagedFile, StoreError, SurveyId, SurveyPath, Wanted,
-};
+use crate::store::{Digest, FileKind, FileRecord, FileWritten, StagedFile, StoreError, SurveyId, SurveyPath, Wanted};
 use content::Found;
 use heliomap_model::PlantId;
 use jiff::Timestamp;
@@ -42,16 +39,16 @@ pub const MAX_TWINS: u32 = 5;
 const WAIT_FOR_FREEING: Duration = Duration::from_secs(5);
 const LOOK_EVERY: Duration = Duration::from_millis(50);
 
-/// Checks that a staged file holds what its place in the survey says.
-pub async fn check(state: &AppState, path: SurveyPath, staged: StagedFile) -> Result<Checked, ApiError> {
+/// Checks that a staged file of a plant holds what its place in the survey says.
+pub async fn check(
+    state: &AppState,
+    plant: PlantId,
+    path: SurveyPath,
+    staged: StagedFile,
+) -> Result<Checked, ApiError> {
     let limits = state.limits.clone();
-    // Images may be decoded: a few at once, so that many that come together take neither all memory nor all cores.
-    let turn = match path.content() {
-        Content::Image => {
-            Some(state.decoding.clone().acquire_owned().await.map_err(|error| ApiError::internal(&error))?)
-        }
-        Content::Json { .. } | Content::Ply => None,
-    };
+    // A few at once, so that many that come together take neither all memory nor all cores.
+    let turn = state.checking.take(state.require_plant(plant).await?.organisation).await;
     let work = tokio::task::spawn_blocking(move || {
         let found = content::check(&staged.path, &path, &limits)?;
         drop(turn);

@@ -3,6 +3,7 @@
 use super::{disk, too_large};
 use crate::http::error::{ApiError, Code};
 use crate::store::{Digest, StagedFile};
+use axum::http::{HeaderMap, header};
 use bytes::Bytes;
 use futures::{Stream, StreamExt};
 use sha2::Digest as _;
@@ -64,6 +65,12 @@ where
     writer.flush().await.map_err(|error| disk(&path, error))?;
     writer.get_ref().sync_all().await.map_err(|error| disk(&path, error))?;
     Ok(StagedFile { path, size, sha256: Digest(hasher.finalize().into()) })
+}
+
+/// Whether a client waits to be asked for the body of its request (`Expect: 100-continue`, RFC 9110, 10.1.1): the first look
+/// at the body asks for it.
+pub fn waits_to_be_asked(headers: &HeaderMap) -> bool {
+    headers.get_all(header::EXPECT).iter().any(|value| value.as_bytes().eq_ignore_ascii_case(b"100-continue"))
 }
 
 /// Takes the rest of a refused body, within reason: a client that is still sending when the connection closes does not

@@ -69,7 +69,7 @@ async fn store_whole(state: &AppState, plant: PlantId, upload: &Upload) -> Resul
     match place {
         Place::Archive => Ok(files::store_archive(state, plant, upload.survey, staged).await?.files),
         Place::File(path) => {
-            let checked = intake::check(state, path, staged).await?;
+            let checked = intake::check(state, plant, path, staged).await?;
             let stored = intake::store(state, plant, upload.survey, vec![checked], None).await?;
             Ok(stored.into_iter().map(files::uploaded).collect())
         }

@@ -9,7 +9,7 @@ use std::io::Read;
 use std::path::Path;
 
 /// Most bytes that are read of a reconstruction, and of the small files beside it.
-const MAX_RECONSTRUCTION_BYTES: u64 = 4 << 30;
+pub(super) const MAX_RECONSTRUCTION_BYTES: u64 = 4 << 30;
 const MAX_SMALL_BYTES: u64 = 16 << 20;
 
 /// One component: what hangs together by common points.
@@ -97,18 +97,27 @@ fn read_text(path: &Path, limit: u64) -> Result<Vec<u8>, ReconstructionError> {
 
 fn parse<T: DeserializeOwned>(path: &Path, text: &[u8]) -> Result<T, ReconstructionError> {
     serde_json::from_slice(text).map_err(|error| {
-        // Python writes NaN and Infinity, which JSON does not know.
         let line = text.split(|byte| *byte == b'\n').nth(error.line().saturating_sub(1)).unwrap_or(&[]);
-        let around = &line[error.column().saturating_sub(12).min(line.len())..(error.column() + 12).min(line.len())];
-        for word in ["NaN", "Infinity"] {
-            if error.is_syntax() && around.windows(word.len()).any(|window| window == word.as_bytes()) {
-                return ReconstructionError::NotFinite {
-                    path: path.to_owned(),
-                    value: word.to_owned(),
-                    place: format!("line {}, column {}", error.line(), error.column()),
-                };
-            }
-        }
-        ReconstructionError::Malformed { path: path.to_owned(), what: error.to_string() }
+        let from = error.column().saturating_sub(NEAR_BYTES).min(line.len());
+        malformed(path, &error, &line[from..(error.column() + NEAR_BYTES).min(line.len())])
     })
+}
+
+/// How much of a text about an error is looked at, bytes to each side.
+pub(super) const NEAR_BYTES: usize = 12;
+
+/// What a text is that cannot be read, by what stands `around` the place of the error.
+pub(super) fn malformed(path: &Path, error: &serde_json::Error, around: &[u8]) -> ReconstructionError {
+    // Python writes NaN and Infinity, which JSON does not know.
+    for word in ["NaN", "Infinity"] {
+        if error.is_syntax() && around.windows(word.len()).any(|window| window == word.as_bytes()) {
+            return ReconstructionError::NotFinite {
+                path: path.to_owned(),
+                value: word.to_owned(),
+                place: format!("line {}, column {}", error.line(), error.column()),
+            };
+        }
+    }
+    let what = if error.is_eof() { format!("it is cut short ({error})") } else { error.to_string() };
+    ReconstructionError::Malformed { path: path.to_owned(), what }
 }
