@@ -22,7 +22,15 @@ export HELIOMAP_DATA
 help: ## List the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
-setup: $(ORT_LIBRARY) web/dist/index.html ## Fetch ONNX Runtime and build the web page, if missing
+# What reconstructs photos, COLMAP as a Python package.
+RECONSTRUCT_PYTHON := .venv/reconstruct/bin/python
+export HELIOMAP_RECONSTRUCT_PYTHON ?= $(abspath $(RECONSTRUCT_PYTHON))
+
+setup: $(ORT_LIBRARY) web/dist/index.html .venv/reconstruct/done ## Fetch ONNX Runtime and pycolmap and build the web page, if missing
+
+.venv/reconstruct/done: crates/photogrammetry/engine/requirements.txt
+	@$(PYTHON) -m venv .venv/reconstruct && .venv/reconstruct/bin/pip install --quiet --disable-pip-version-check --requirement $<
+	@touch $@
 
 $(ORT_LIBRARY):
 	@echo "fetching ONNX Runtime $(ONNXRUNTIME_VERSION)"
@@ -40,6 +48,7 @@ web/dist/index.html: web/node_modules/done $(wildcard web/src/* web/src/*/* web/
 
 demo: setup ## Map the example plant through the HTTP service and check it (KEEP=1 leaves the service running)
 	$(CARGO) build --release --locked
+	$(PYTHON) examples/photos.py --binary target/release/heliomap
 	$(PYTHON) examples/demo.py --binary target/release/heliomap $(if $(KEEP),--keep)
 
 test: lint unit ## Run all tests
@@ -74,10 +83,11 @@ deny: .cargo-deny/bin/cargo-deny ## Check dependencies by deny.toml: advisories 
 .cargo-deny/bin/cargo-deny:
 	$(CARGO) install cargo-deny --version $(CARGO_DENY_VERSION) --locked --quiet --root .cargo-deny
 
-# Tests that need Postgres or an S3-compatible server are ignored by plain `cargo test`; both servers are started here.
+# Tests that need Postgres, an S3-compatible server or pycolmap are ignored by plain `cargo test`; the servers are started here.
 unit: setup .venv/s3/done ## Tests alone
 	tests/with-postgres.sh tests/with-s3.sh bash -c '$(CARGO) test --locked --workspace && \
-	  $(CARGO) test --locked --workspace --test store --test server -- --ignored'
+	  $(CARGO) test --locked --workspace --test store --test server --test engine -- --ignored'
+	cd crates/photogrammetry/engine && PYTHONDONTWRITEBYTECODE=1 $(abspath $(RECONSTRUCT_PYTHON)) -m unittest --quiet
 	$(MAKE) --no-print-directory page client
 
 page: web/dist/index.html ## Use the web page in Chromium

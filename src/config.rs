@@ -6,12 +6,14 @@ mod access;
 mod identity;
 mod limits;
 mod mapping;
+mod reconstruction;
 mod units;
 
 pub use access::{KeysArgs, KeysCommand, OrganisationsArgs, OrganisationsCommand, Quota};
 pub use identity::OidcArgs;
 pub use limits::Limits;
 pub use mapping::StartJob;
+pub use reconstruction::ReconstructionArgs;
 use units::{parse_days, parse_megapixels, parse_seconds};
 
 use crate::store::Bucket;

@@ -42,6 +42,8 @@ enum Command {
     Verify(VerifyArgs),
     /// Map the plant in a folder as OpenSfM leaves it; no server is needed.
     Map(commands::map::MapArgs),
+    /// Reconstruct photos: where each was taken and which points it shows.
+    Reconstruct(commands::reconstruct::ReconstructArgs),
     /// Find the modules in photos and write their boxes.
     Detect(commands::detect::DetectArgs),
     /// Compare a plant with a truth or any reference model.
@@ -119,6 +121,7 @@ fn run(command: Command) -> anyhow::Result<()> {
         Command::Restore(args) => commands::backup::restore(args),
         Command::Verify(args) => commands::backup::verify(args),
         Command::Map(args) => commands::map::run(&args),
+        Command::Reconstruct(args) => commands::reconstruct::run(&args),
         Command::Detect(args) => commands::detect::run(&args),
         Command::EvaluateDetection(args) => commands::evaluate_detection::run(&args),
         Command::Evaluate(args) => commands::evaluate::run(&args),

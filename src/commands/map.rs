@@ -1,24 +1,25 @@
 //! `heliomap map`: a folder in, a plant out, no server.
 
 use super::output::{Output, notify, prepare_folder, print};
+use super::progress::Progress;
+use super::reconstruct;
 use anyhow::{Context, bail, ensure};
 use clap::Args;
-use heliomap::config::{DetectorArgs, ImageSizeArgs, StartJob};
+use heliomap::config::{DetectorArgs, ImageSizeArgs, ReconstructionArgs, StartJob};
 use heliomap_mapping::pipeline::{self, Boxes, MapOptions, Observer, Stage, Subject};
 use heliomap_mapping::refinement::Method;
 use heliomap_model::{Layer, PlantId, PlantModel};
 use heliomap_overlay as overlay;
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde_json::json;
 use std::fmt::Write;
-use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 
 /// Map the plant in a folder as OpenSfM leaves it.
 #[derive(Debug, Args)]
 #[command(after_help = "The folder holds reconstruction.json, reference_lla.json, images/ and, where there is one, \
-                        undistorted/ with images/ and depthmaps/merged.ply.\n\n\
+                        undistorted/ with images/ and depthmaps/merged.ply. With --reconstruct, images/ \
+                        is enough.\n\n\
                         Example: heliomap map my-survey --out plant.geojson --overlay pictures --timings")]
 pub struct MapArgs {
     /// Folder with the reconstruction and the images
@@ -50,6 +51,11 @@ pub struct MapArgs {
     /// Write the whole model as JSON, for --previous of the next survey
     #[arg(long, value_name = "FILE")]
     model_out: Option<PathBuf>,
+    /// Reconstruct the photos first, as `heliomap reconstruct` does, where the folder has no reconstruction
+    #[arg(long)]
+    reconstruct: bool,
+    #[command(flatten)]
+    reconstruction: ReconstructionArgs,
     #[command(flatten)]
     options: StartJob,
     /// How positions are refined
@@ -107,9 +113,13 @@ pub fn run(args: &MapArgs) -> anyhow::Result<()> {
         (None, Some(detector)) => Boxes::Detector(&**detector),
         (None, None) => bail!("neither a detector nor boxes were given"),
     };
-    let report = Report::new();
+    if args.reconstruct && !args.folder.join("reconstruction.json").exists() {
+        let made = reconstruct::reconstruct(&args.folder, &args.reconstruction, args.threads, args.image_size)?;
+        reconstruct::announce(&made);
+    }
+    let report = Report(Progress::new());
     let mapping = pipeline::map_folder(&args.folder, boxes, &options, &subject, &report)?;
-    report.finish();
+    report.0.finish();
 
     let model = &mapping.model;
     for (layer, output) in &outputs.layers {
@@ -202,45 +212,10 @@ fn read_model(path: &Path) -> anyhow::Result<PlantModel> {
     serde_json::from_reader(std::io::BufReader::new(file)).with_context(what)
 }
 
-/// A bar on a terminal, a line per tenth elsewhere.
-struct Report {
-    bar: Option<ProgressBar>,
-    last: Mutex<Option<(Stage, usize)>>,
-}
-
-impl Report {
-    fn new() -> Self {
-        let bar = std::io::stderr().is_terminal().then(|| {
-            let bar = ProgressBar::with_draw_target(Some(1), ProgressDrawTarget::stderr());
-            if let Ok(style) = ProgressStyle::with_template("{msg:<10} [{bar:40}] {pos}/{len} {elapsed}") {
-                bar.set_style(style.progress_chars("=> "));
-            }
-            bar
-        });
-        Self { bar, last: Mutex::new(None) }
-    }
-
-    fn finish(&self) {
-        if let Some(bar) = &self.bar {
-            bar.finish_and_clear();
-        }
-    }
-}
+struct Report(Progress);
 
 impl Observer for Report {
     fn progress(&self, stage: Stage, done: usize, total: usize) {
-        if let Some(bar) = &self.bar {
-            bar.set_message(stage.as_str());
-            bar.set_length(total as u64);
-            bar.set_position(done as u64);
-            return;
-        }
-        let tenth = (done * 10).checked_div(total).unwrap_or(10);
-        if let Ok(mut last) = self.last.lock()
-            && *last != Some((stage, tenth))
-        {
-            *last = Some((stage, tenth));
-            notify(format_args!("{}: {done} of {total}", stage.as_str()));
-        }
+        self.0.show(stage.as_str(), done, total);
     }
 }

@@ -11,6 +11,8 @@ pub mod map;
 pub mod openapi;
 pub mod organisations;
 pub mod output;
+mod progress;
+pub mod reconstruct;
 pub mod serve;
 pub mod worker;
 

@@ -3,11 +3,9 @@
 
 use super::{DetectionError, Detector};
 use crate::geometry::Quad;
-use crate::reconstruction::exif;
+use crate::reconstruction::{exif, xmp};
 use image::RgbImage;
 use nalgebra::Vector2;
-use std::fs::File;
-use std::io::Read;
 use std::path::Path;
 
 /// The short side of a module, metres: framed ones have 0.99 to 1.13, thin-film ones 0.6.
@@ -16,10 +14,6 @@ const SHORT_SIDE_M: f64 = 1.05;
 const TRIED_M: [f64; 3] = [0.011, 0.02, 0.045];
 /// The most pixels of the middle of a photo that are tried.
 const MOST_PX2: f64 = 4e6;
-/// Diagonal of the film that "35 mm equivalent" speaks of, millimetres.
-const FILM_DIAGONAL_MM: f64 = 43.27;
-/// Metadata is looked for in so much of the file's beginning.
-const METADATA_BYTES: u64 = 256 << 10;
 /// Heights above the ground that a drone may tell, metres.
 const HEIGHTS_M: std::ops::RangeInclusive<f64> = 3.0..=500.0;
 
@@ -27,26 +21,9 @@ const HEIGHTS_M: std::ops::RangeInclusive<f64> = 3.0..=500.0;
 /// height above the take-off point (XMP, as DJI writes it) and the focal length (EXIF) in its file; `None` where the file
 /// does not tell both.
 pub fn from_metadata(path: &Path, width: u32, height: u32) -> Option<f64> {
-    let mut start = Vec::new();
-    File::open(path).ok()?.take(METADATA_BYTES).read_to_end(&mut start).ok()?;
-    let height_m = relative_altitude_m(&start)?;
-    let focal_mm = exif::film_focal_mm(path)?;
-    let focal_px = focal_mm / FILM_DIAGONAL_MM * f64::from(width).hypot(f64::from(height));
-    (HEIGHTS_M.contains(&height_m) && focal_px > 1.0).then(|| height_m / focal_px)
-}
-
-/// The number in `drone-dji:RelativeAltitude="+41.30"`, or in the element of that name.
-fn relative_altitude_m(bytes: &[u8]) -> Option<f64> {
-    const KEY: &[u8] = b"drone-dji:RelativeAltitude";
-    let at = bytes.windows(KEY.len()).position(|window| window == KEY)? + KEY.len();
-    let text: String = bytes[at..]
-        .iter()
-        .map(|byte| char::from(*byte))
-        .skip_while(|c| matches!(c, '=' | '"' | '\'' | '>' | ' '))
-        .take_while(|c| c.is_ascii_digit() || matches!(c, '+' | '-' | '.'))
-        .take(16)
-        .collect();
-    text.parse().ok().filter(|value: &f64| value.is_finite())
+    let height_m = xmp::number(path, "drone-dji:RelativeAltitude")?;
+    let focal_px = exif::film_focal_px(path, width, height)?;
+    HEIGHTS_M.contains(&height_m).then(|| height_m / focal_px)
 }
 
 /// Ground sampling distance in metres per pixel by the look of the photo: the detector searches its middle as if it had been
@@ -93,20 +70,6 @@ fn in_benches(quads: &[Quad]) -> Vec<Quad> {
 mod tests {
     use super::*;
     use crate::detection::{Detection, Source};
-
-    #[test]
-    fn the_height_that_a_drone_writes_is_read() {
-        for (text, height_m) in [
-            ("xmp drone-dji:RelativeAltitude=\"+41.30\" more", Some(41.3)),
-            ("<drone-dji:RelativeAltitude>-2.5</drone-dji:RelativeAltitude>", Some(-2.5)),
-            ("drone-dji:RelativeAltitude=\"high\"", None),
-            ("drone-dji:RelativeAltitude", None),
-            ("nothing", None),
-        ] {
-            assert_eq!(relative_altitude_m(text.as_bytes()), height_m, "{text}");
-        }
-        assert_eq!(from_metadata(Path::new("missing.jpg"), 100, 100), None);
-    }
 
     /// Sees modules of `side_px` pixels where they have 20 to 30 pixels at the scale that it is told.
     struct Picky {

@@ -13,6 +13,9 @@ const MAX_CAMERA: usize = 80;
 /// Heights that a drone may tell, metres.
 const HEIGHTS_M: std::ops::Range<f64> = -1_000.0..20_000.0;
 
+/// Diagonal of the film whose view EXIF's equivalent focal length means (EXIF 2.32, FocalLengthIn35mmFilm), millimetres.
+const FILM_DIAGONAL_MM: f64 = 43.27;
+
 /// What a camera wrote into a photo's file.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Exposure {
@@ -41,9 +44,12 @@ pub fn read(path: &Path) -> Exposure {
     Exposure { camera: fields.camera(), taken: fields.taken(), position: fields.position() }
 }
 
-/// The focal length that a camera with 35 mm film would have had for the same view, millimetres.
-pub fn film_focal_mm(path: &Path) -> Option<f64> {
-    Fields::of_file(path)?.film_focal_mm.map(f64::from)
+/// The focal length by that of a camera with 35 mm film and the same view, which is written in whole millimetres, pixels of a
+/// photo of `width` x `height`.
+pub fn film_focal_px(path: &Path, width: u32, height: u32) -> Option<f64> {
+    let focal_mm = Fields::of_file(path)?.film_focal_mm.map(f64::from)?;
+    let focal_px = focal_mm / FILM_DIAGONAL_MM * f64::from(width).hypot(f64::from(height));
+    (focal_px > 1.0).then_some(focal_px)
 }
 
 /// The most values that an entry of a TIFF's first directory claims, of those that a decoder reads: the baseline tags, less

@@ -11,6 +11,7 @@ pub mod photo;
 mod plausible;
 pub mod ply;
 pub mod quality;
+pub mod xmp;
 
 use crate::geometry::{Camera, PointCloud, Pose};
 pub use error::ReconstructionError;

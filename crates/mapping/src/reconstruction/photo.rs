@@ -113,6 +113,11 @@ fn format_by_name(name: &str) -> Option<ImageFormat> {
     }
 }
 
+/// Whether a file is named as photos that can be read are.
+pub fn is_photo_name(name: &str) -> bool {
+    format_by_name(name).is_some()
+}
+
 fn format_name(format: ImageFormat) -> &'static str {
     match format {
         ImageFormat::Jpeg => "JPEG",
