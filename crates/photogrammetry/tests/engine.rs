@@ -95,13 +95,15 @@ fn an_engine_that_fails_is_an_error_with_its_last_words() {
     let crashed = failure(&folder, &options(script(&folder, "echo not json; echo out of memory >&2; kill -9 $$")));
     assert_eq!(crashed.code(), "engine_failed");
     assert!(crashed.to_string().contains("out of memory"), "{crashed}");
-    let refused = r#"cat > /dev/null; echo '{"error": {"code": "nothing_reconstructed", "message": "no two photos fit"}}'"#;
+    let refused =
+        r#"cat > /dev/null; echo '{"error": {"code": "nothing_reconstructed", "message": "no two photos fit"}}'"#;
     let refused = failure(&folder, &options(script(&folder, refused)));
     assert_eq!((refused.code(), refused.to_string().as_str()), ("nothing_reconstructed", "no two photos fit"));
-    let elsewhere = r#"{"result": {"cameras": [null], "components": [{"aligned": true, "points": [], "reprojection_px": 0.1,
+    let elsewhere =
+        r#"{"result": {"cameras": [null], "components": [{"aligned": true, "points": [], "reprojection_px": 0.1,
         "shots": [{"image": 7, "rotation": [[1,0,0],[0,1,0],[0,0,1]], "translation": [0,0,0], "points": 1,
         "reprojection_px": null}]}]}}"#
-        .replace('\n', " ");
+            .replace('\n', " ");
     let elsewhere = failure(&folder, &options(script(&folder, &format!("echo '{elsewhere}'"))));
     assert_eq!(elsewhere.code(), "reconstruction_not_aligned");
 }
@@ -139,7 +141,8 @@ fn surveys_that_cannot_be_placed_are_refused() {
 
     let one_place = survey(&[1]);
     for copy in ["b.jpg", "c.jpg"] {
-        std::fs::copy(one_place.path().join("images/DJI_0001.jpg"), one_place.path().join("images").join(copy)).unwrap();
+        std::fs::copy(one_place.path().join("images/DJI_0001.jpg"), one_place.path().join("images").join(copy))
+            .unwrap();
     }
     assert_eq!(failure(&one_place, &never(&one_place)).code(), "images_of_one_place");
 
