@@ -65,7 +65,7 @@ struct Feature {
 #[derive(Deserialize)]
 struct Geometry {
     r#type: String,
-    coordinates: Vec<Vec<Vec<f64>>>,
+    coordinates: serde_json::Value,
 }
 
 #[derive(Deserialize)]
@@ -241,23 +241,44 @@ fn from_truth(
     Ok(builder.finish(name, reference))
 }
 
-/// The four corners of a closed ring.
+/// A position as it is written.
+type Position = Vec<f64>;
+
+/// The four corners of a closed ring, or of the two rings that it was cut into at 180 degrees.
 fn ring(geometry: &Geometry) -> Result<[Lla; 4], String> {
     let no_ring = || "the geometry is not a polygon of one ring with four corners".to_owned();
-    if geometry.r#type != "Polygon" {
-        return Err(no_ring());
-    }
-    let [ring] = geometry.coordinates.as_slice() else {
-        return Err(no_ring());
+    let positions = match geometry.r#type.as_str() {
+        "Polygon" => {
+            let rings: Vec<Vec<Position>> = Deserialize::deserialize(&geometry.coordinates).map_err(|_| no_ring())?;
+            let [ring] = <[_; 1]>::try_from(rings).map_err(|_| no_ring())?;
+            open(ring).ok_or_else(no_ring)?
+        }
+        "MultiPolygon" => {
+            let parts: Vec<[Vec<Position>; 1]> =
+                Deserialize::deserialize(&geometry.coordinates).map_err(|_| no_ring())?;
+            let [first, second] = <[_; 2]>::try_from(parts).map_err(|_| no_ring())?.map(|[ring]| open(ring));
+            joined(first.ok_or_else(no_ring)?, second.ok_or_else(no_ring)?)
+        }
+        _ => return Err(no_ring()),
     };
-    if ring.len() != 5 || ring[0] != ring[4] {
-        return Err(no_ring());
-    }
-    let mut corners = [Lla { latitude_deg: 0.0, longitude_deg: 0.0, height_m: 0.0 }; 4];
-    for (corner, position) in corners.iter_mut().zip(ring) {
-        *corner = lla(position)?;
-    }
-    Ok(corners)
+    let corners: Result<Vec<Lla>, String> = positions.iter().map(|position| lla(position)).collect();
+    <[Lla; 4]>::try_from(corners?).map_err(|_| no_ring())
+}
+
+/// A ring without the repetition of its first position; `None` where it is not closed.
+fn open(mut ring: Vec<Position>) -> Option<Vec<Position>> {
+    let last = ring.pop()?;
+    (ring.first() == Some(&last)).then_some(ring)
+}
+
+/// The corners of a polygon that was cut at 180 degrees. The part with its first corner begins with that, the other on the
+/// line.
+fn joined(first: Vec<Position>, second: Vec<Position>) -> Vec<Position> {
+    let is_cut = |position: &Position| position.first().is_some_and(|longitude| longitude.abs() == 180.0);
+    let (begin, other) = if first.first().is_some_and(is_cut) { (second, first) } else { (first, second) };
+    let at = begin.iter().position(is_cut).unwrap_or(begin.len());
+    let (before, after) = begin.split_at(at);
+    before.iter().chain(&other).chain(after).filter(|position| !is_cut(position)).cloned().collect()
 }
 
 /// A position of longitude, latitude and height.
@@ -333,6 +354,21 @@ mod tests {
         assert_eq!((model.lines[0].name.as_str(), model.lines[0].index), ("north", None));
         let [width_m, height_m] = model.modules[0].extent_m();
         assert!((width_m - 0.719).abs() < 0.01 && (height_m - 1.219).abs() < 0.01, "{width_m} {height_m}");
+    }
+
+    #[test]
+    fn a_module_that_is_cut_at_180_degrees_is_one() {
+        let properties = r#"{"line": "north", "bench": 7, "row": 1, "number": 3}"#;
+        let parts = [
+            "[[[179.999995,49.8,400],[180,49.8,400],[180,49.80001,400.5],[179.999995,49.80001,400.5],[179.999995,49.8,400]]]",
+            "[[[-180,49.8,400],[-179.999995,49.8,400],[-179.999995,49.80001,400.5],[-180,49.80001,400.5],[-180,49.8,400]]]",
+        ];
+        for order in [[0, 1], [1, 0]] {
+            let rings = order.map(|part| parts[part]).join(",");
+            let cut = feature(&rings, properties).replace("\"Polygon\"", "\"MultiPolygon\"");
+            let [width_m, height_m] = parse(&cut).unwrap().modules[0].extent_m();
+            assert!((width_m - 0.719).abs() < 0.01 && (height_m - 1.219).abs() < 0.01, "{width_m} {height_m}");
+        }
     }
 
     #[test]
