@@ -60,12 +60,14 @@ codes! {
     WebhookNotFound = NOT_FOUND, "webhook_not_found", "There is no such webhook";
     DeliveryNotFound = NOT_FOUND, "delivery_not_found", "There is no such message";
     ModuleNotFound = NOT_FOUND, "module_not_found", "There is no such module";
+    FileNotFound = NOT_FOUND, "file_not_found", "There is no such file";
     MethodNotAllowed = METHOD_NOT_ALLOWED, "method_not_allowed", "The method does not apply here";
     NotAcceptable = NOT_ACCEPTABLE, "not_acceptable", "No answer can be sent in that way";
     Timeout = REQUEST_TIMEOUT, "timeout", "The request took too long";
     UploadStalled = REQUEST_TIMEOUT, "upload_stalled", "The upload stood still";
     SurveyIncomplete = CONFLICT, "survey_incomplete", "The survey cannot be mapped yet";
     JobFinished = CONFLICT, "job_finished", "The job has ended";
+    NameTaken = CONFLICT, "name_taken", "Another has this name";
     KeyRevoked = CONFLICT, "key_revoked", "The key is revoked";
     JobStopping = CONFLICT, "job_stopping", "The survey's cancelled job has not stopped yet";
     TooManyWebhooks = CONFLICT, "too_many_webhooks", "There are as many webhooks as there may be";
@@ -82,6 +84,7 @@ codes! {
     ChecksumMismatch = UNPROCESSABLE_ENTITY, "checksum_mismatch", "The bytes came changed";
     IdempotencyKeyReused = UNPROCESSABLE_ENTITY, "idempotency_key_reused", "The key belongs to another request";
     InvalidName = UNPROCESSABLE_ENTITY, "invalid_name", "The name cannot be used";
+    NameTwice = UNPROCESSABLE_ENTITY, "name_twice", "Two files have the same name";
     WebhookUrl = UNPROCESSABLE_ENTITY, "webhook_url", "The webhook's URL cannot be used";
     InvalidFields = UNPROCESSABLE_ENTITY, "invalid_fields", "The document has the wrong fields";
     UnknownFile = UNPROCESSABLE_ENTITY, "unknown_file", "The file is no part of a reconstruction";
@@ -187,6 +190,9 @@ impl From<StoreError> for ApiError {
     fn from(error: StoreError) -> Self {
         match &error {
             StoreError::Gone { what: "plant" } => Self::new(Code::PlantNotFound, "the plant was deleted meanwhile"),
+            StoreError::NameTaken => {
+                Self::new(Code::NameTaken, "another one has this name: choose another name, or rename the other one first")
+            }
             StoreError::OverQuota { what, used, quota } => crate::http::controllers::usage::over_quota(what, *used, *quota),
             StoreError::TooManyUploads { open, max } => Self::new(
                 Code::TooManyUploads,

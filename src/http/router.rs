@@ -1,8 +1,8 @@
 //! The table of contents.
 
 use super::controllers::{
-    events, features, files, health, images, jobs, keys, models, openapi as api_description, page, plants, surveys,
-    usage, webhooks,
+    events, features, file_deletion, files, health, images, jobs, keys, models, openapi as api_description, page,
+    plants, surveys, usage, webhooks,
 };
 use super::description::examples;
 use super::error;
@@ -63,9 +63,9 @@ struct Description;
 fn prompt() -> OpenApiRouter<AppState> {
     OpenApiRouter::new()
         .routes(routes!(plants::create, plants::list))
-        .routes(routes!(plants::get, plants::delete))
+        .routes(routes!(plants::get, plants::rename, plants::delete))
         .routes(routes!(surveys::create, surveys::list))
-        .routes(routes!(surveys::get))
+        .routes(routes!(surveys::get, surveys::rename, surveys::delete))
         .routes(routes!(images::list))
         .routes(routes!(images::positions))
         .routes(routes!(jobs::start, jobs::list_of_survey))
@@ -95,10 +95,10 @@ fn prompt() -> OpenApiRouter<AppState> {
 /// Requests that take as long as their bytes come.
 fn uploads() -> OpenApiRouter<AppState> {
     OpenApiRouter::new()
-        .routes(routes!(files::put_image))
+        .routes(routes!(files::put_image, file_deletion::delete_image))
         .routes(routes!(files::post_images))
         .routes(routes!(files::put_reconstruction, files::post_reconstruction))
-        .routes(routes!(files::put_reconstruction_file))
+        .routes(routes!(files::put_reconstruction_file, file_deletion::delete_reconstruction_file))
         .routes(routes!(tus::begin::create, tus::list::list, tus::options))
         .routes(routes!(tus::head, tus::get, tus::append::patch, tus::terminate, tus::post))
 }

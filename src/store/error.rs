@@ -13,6 +13,9 @@ pub enum StoreError {
     /// The same bytes are being deleted, because no row refers to them: a retry in a moment succeeds.
     #[error("the blob {sha256} is being deleted")]
     BeingFreed { sha256: Digest },
+    /// Another has the name.
+    #[error("the name is taken")]
+    NameTaken,
     /// A quota of the organisation would be exceeded.
     #[error("quota exceeded: the organisation uses {used} of {quota} {what}")]
     OverQuota { what: &'static str, used: u64, quota: u64 },

@@ -109,6 +109,8 @@ pub struct Queue {
 /// A mapping to be queued.
 #[derive(Debug, Clone)]
 pub struct JobRequest {
+    /// The identifier of the job, new for each but those that are asked for again.
+    pub id: JobId,
     pub plant: PlantId,
     pub survey: SurveyId,
     /// The mapping's options, JSON.

@@ -52,7 +52,7 @@ pub use requests::RequestStore;
 pub use secret::Secret;
 pub use sqlite::SqliteStore;
 pub use survey_path::{Content, FileKind, ImageName, InvalidPath, SurveyPath, looks_like_photo};
-pub use surveys::{FileRecord, FileWritten, Survey, SurveyStore, Wanted};
+pub use surveys::{FileDeleted, FileRecord, FileWritten, Survey, SurveyStore, Wanted};
 pub use tasks::{GivenBack, ImageTask, OwnTask, TaskClaim, TaskStore};
 pub use uploads::{Upload, UploadBounds, UploadStore};
 pub use usage::{BlobRecord, Quotas, UnusedBlob, Usage, UsageStore};

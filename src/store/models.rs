@@ -108,6 +108,20 @@ impl GeoBox {
         })
     }
 
+    /// The smallest box around boxes that are near each other; it goes on beyond the line of 180 degrees where they lie on
+    /// both sides of it.
+    pub fn around_all(boxes: impl Iterator<Item = Self> + Clone) -> Option<Self> {
+        let plain = boxes.clone().reduce(Self::union)?;
+        if plain.width_deg() <= 180.0 {
+            return Some(plain);
+        }
+        let east = |one: Self| match one.min_lon < 0.0 {
+            true => Self { min_lon: one.min_lon + 360.0, max_lon: one.max_lon + 360.0, ..one },
+            false => one,
+        };
+        boxes.map(east).reduce(Self::union).filter(|beyond| beyond.width_deg() < plain.width_deg()).or(Some(plain))
+    }
+
     /// The smallest box around both.
     pub fn union(self, other: Self) -> Self {
         Self {

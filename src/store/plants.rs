@@ -39,6 +39,9 @@ pub trait PlantStore: Send + Sync + 'static {
         prefix: &str,
         page: Page,
     ) -> Result<Vec<Plant>, StoreError>;
+    /// Gives a plant another name. Fails with [`StoreError::NameTaken`] where another of its organisation has it, and
+    /// [`StoreError::Gone`] where there is no such plant.
+    async fn rename_plant(&self, id: PlantId, name: &str) -> Result<Plant, StoreError>;
     /// Deletes a plant with all rows that belong to it, and records that its blobs are to be deleted; `false` where there was
     /// none. Workers lose the leases of its jobs.
     async fn delete_plant(&self, id: PlantId, now: Timestamp) -> Result<bool, StoreError>;

@@ -2,7 +2,7 @@
 
 use super::digest::Digest;
 use super::error::StoreError;
-use super::ids::SurveyId;
+use super::ids::{SurveyId, UploadId};
 use super::listing::{Created, Page};
 use super::survey_path::SurveyPath;
 use heliomap_mapping::reconstruction::PhotoFacts;
@@ -69,6 +69,16 @@ pub enum FileWritten {
     Unchanged,
 }
 
+/// Outcome of deleting a file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum FileDeleted {
+    Deleted,
+    /// There is no such file.
+    Absent,
+    /// The file does not meet the precondition.
+    Other,
+}
+
 /// Surveys and their files.
 #[async_trait::async_trait]
 pub trait SurveyStore: Send + Sync + 'static {
@@ -78,6 +88,21 @@ pub trait SurveyStore: Send + Sync + 'static {
     async fn survey(&self, plant: PlantId, id: SurveyId) -> Result<Option<Survey>, StoreError>;
     /// A plant's surveys whose names begin with `prefix`, in order of creation.
     async fn surveys(&self, plant: PlantId, prefix: &str, page: Page) -> Result<Vec<Survey>, StoreError>;
+    /// Gives a survey another name. Fails with [`StoreError::NameTaken`] where another of its plant has it, and
+    /// [`StoreError::Gone`] where there is no such survey.
+    async fn rename_survey(&self, id: SurveyId, name: &str) -> Result<Survey, StoreError>;
+    /// Deletes a survey with its files, uploads and jobs; workers lose the leases of its jobs. Models that were made from it
+    /// stay, with a warning. Returns its uploads, whose bytes may still exist; `None` where there was no such survey.
+    async fn delete_survey(&self, id: SurveyId, now: Timestamp) -> Result<Option<Vec<UploadId>>, StoreError>;
+    /// Deletes a file if it meets a precondition; models that were made from its survey get a warning that names it. A job
+    /// that runs goes on with the files that it began with.
+    async fn delete_file(
+        &self,
+        survey: SurveyId,
+        path: &SurveyPath,
+        wanted: Option<&Wanted>,
+        now: Timestamp,
+    ) -> Result<FileDeleted, StoreError>;
     /// Stores the records of files, all or none; a file at the same path is replaced. Returns one outcome per file, in order. The
     /// bytes must be reserved and stored before: [`StoreError::BeingFreed`] where they were deleted since.
     async fn put_files(&self, survey: SurveyId, files: &[FileRecord]) -> Result<Vec<FileWritten>, StoreError>;

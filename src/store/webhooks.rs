@@ -10,6 +10,7 @@ use jiff::Timestamp;
 use std::fmt;
 use std::str::FromStr;
 use std::time::Duration;
+use uuid::Uuid;
 
 /// Maximum number of webhooks of an organisation.
 pub const MAX_WEBHOOKS: u32 = 100;
@@ -172,11 +173,13 @@ pub trait WebhookStore: Send + Sync + 'static {
         state: Option<DeliveryState>,
         page: Page,
     ) -> Result<Vec<Delivery>, StoreError>;
-    /// Queues a message in any state for sending again, with all attempts.
+    /// Queues a message in any state for sending again, with all attempts. Under the same identifier `once` it is done once
+    /// a day: after that the message is returned as it is.
     async fn resend_delivery(
         &self,
         webhook: WebhookId,
         id: DeliveryId,
+        once: Option<Uuid>,
         now: Timestamp,
     ) -> Result<Option<Delivery>, StoreError>;
 

@@ -40,6 +40,8 @@ fn client() -> Client {
 pub enum Act {
     /// Maps a plant of so many columns.
     Map(u32),
+    /// As [`Self::Map`], across the line of 180 degrees.
+    MapAcross(u32),
     RefuseInput,
     FailEnvironment,
     Panic,
@@ -89,6 +91,12 @@ impl Mapper for ScriptedMapper {
         observer.progress(Stage::Detect, 1, 2);
         match act {
             Act::Map(columns) => Ok(model(subject, options, columns)),
+            Act::MapAcross(columns) => {
+                let mut model = model(subject, options, columns);
+                // 7 cm west of the line, which is in the first module.
+                model.reference.origin.longitude_deg = 179.999_999;
+                Ok(model)
+            }
             Act::RefuseInput => {
                 Err(MapError::Input { code: "no_modules", message: "no photo shows a module; fly higher".to_owned() })
             }

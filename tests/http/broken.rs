@@ -130,7 +130,7 @@ async fn fails(app: &App, files: &Files, code: &str, words: &[&str]) -> String {
     let survey = Files::survey(app).await;
     let (status, answer) = app.put(&format!("{survey}/reconstruction"), files.archive()).await;
     if status != StatusCode::OK {
-        // What one file tells by itself is said when it comes.
+        // What is wrong with a single file is said at its upload.
         words.iter().for_each(|word| assert_problem((status, answer.clone()), 422, code, word));
         assert_eq!(stored(app, &survey).await, json!([]));
         return survey;

@@ -1,6 +1,6 @@
 //! The same request under the same key is done once and answered the same.
 
-use crate::app::{App, assert_problem, jpeg, json_of, plant_path};
+use crate::app::{Act, App, assert_problem, jpeg, json_of, plant_path};
 use heliomap::store::Scope;
 use reqwest::multipart::{Form, Part};
 use reqwest::{Method, RequestBuilder, StatusCode};
@@ -100,4 +100,26 @@ async fn each_organisation_has_keys_of_its_own_and_secrets_are_not_kept() {
     let of_b = sent(create(&app, "one", "Sunfield")).await;
     assert_eq!((of_b.0, of_b.1), (StatusCode::CREATED, false));
     assert_ne!(of_a.2["id"], of_b.2["id"]);
+}
+
+#[tokio::test]
+async fn a_job_is_started_once_though_the_answer_was_lost_with_the_service() {
+    let app = App::new(&[Act::Map(1)]).await;
+    let survey = app.complete_survey().await;
+    let start = async |key: &str| {
+        let request = app.request(Method::POST, &format!("{survey}/jobs")).header("idempotency-key", key);
+        json_of(request.send().await.unwrap()).await
+    };
+    let (status, job) = start("once").await;
+    assert_eq!(status, StatusCode::ACCEPTED, "{job}");
+    app.follow(&job).await;
+    // As where it was killed before the answer was kept: the key is free again, and the job has ended.
+    let file = app.folder.path().join("heliomap.db");
+    let rows = sqlx::SqlitePool::connect(&format!("sqlite:{}", file.display())).await.unwrap();
+    sqlx::query("DELETE FROM requests").execute(&rows).await.unwrap();
+    let (status, again) = start("once").await;
+    assert_eq!((status, &again["id"], &again["state"]), (StatusCode::ACCEPTED, &job["id"], &json!("succeeded")));
+    assert_eq!(app.get(&format!("{survey}/jobs")).await.1["items"].as_array().unwrap().len(), 1);
+    let (_, other) = start("twice").await;
+    assert_ne!(other["id"], job["id"]);
 }

@@ -143,3 +143,41 @@ async fn parts_of_files_and_coded_ones_are_no_files() {
     assert_eq!(app.get(&survey).await.1["files"], json!([]));
     assert_eq!(put("content-encoding", "identity").await.0, StatusCode::CREATED);
 }
+
+/// A form of parts, each with its headers as they are.
+fn form(parts: &[(&[u8], &[u8])]) -> Vec<u8> {
+    let part = |(head, content): &(&[u8], &[u8])| {
+        [b"--bbb\r\ncontent-disposition: form-data; name=\"file\"; ", *head, b"\r\n\r\n", content, b"\r\n"].concat()
+    };
+    [parts.iter().map(part).collect::<Vec<_>>().concat(), b"--bbb--\r\n".to_vec()].concat()
+}
+
+#[tokio::test]
+async fn forms_of_many_programs_are_read() {
+    let app = App::new(&[]).await;
+    let survey = app.survey().await;
+    let post = async |body: Vec<u8>| {
+        let request = app.request(Method::POST, &format!("{survey}/images"));
+        let request = request.header("content-type", "multipart/form-data; boundary=bbb").body(body);
+        json_of(request.send().await.unwrap()).await
+    };
+    let photo = jpeg(16, 12);
+    for (head, path) in [
+        (b"filename*=utf-8''h%C3%B6he1.jpg".as_slice(), "images/h\u{f6}he1.jpg"),
+        (b"filename=\"=?utf-8?B?aMO2aGUyLmpwZw==?=\"; filename*=utf-8''h%C3%B6he2.jpg", "images/h\u{f6}he2.jpg"),
+        (b"filename=\"=?utf-8?B?aMO2aGUzLmpwZw==?=\"", "images/h\u{f6}he3.jpg"),
+        (b"filename=\"h\xf6he4.jpg\"", "images/h\u{f6}he4.jpg"),
+        ("filename=\"ho\u{308}he5.jpg\"".as_bytes(), "images/h\u{f6}he5.jpg"),
+        (b"filename=\"C:\\Users\\me\\c.jpg\"", "images/c.jpg"),
+    ] {
+        let (status, answer) = post(form(&[(head, &photo)])).await;
+        assert_eq!((status, &answer["files"][0]["path"]), (StatusCode::OK, &json!(path)), "{answer}");
+    }
+    let other = jpeg(20, 12);
+    let (status, answer) = post(form(&[(b"filename=f.jpg", &photo), (b"filename=f.jpg", &other)])).await;
+    assert_eq!((status.as_u16(), &answer["refused"][0]["code"]), (422, &json!("name_twice")), "{answer}");
+    assert_eq!(answer["files"][0]["width_px"], 16);
+    assert_eq!(post(form(&[(b"filename=f.jpg", &photo), (b"filename=f.jpg", &photo)])).await.0, StatusCode::OK);
+    let (_, coded) = post(form(&[(b"filename=g.jpg\r\ncontent-transfer-encoding: base64", b"/9j/")])).await;
+    assert_eq!(coded["refused"][0]["code"], "unsupported_media_type", "{coded}");
+}

@@ -256,7 +256,7 @@ async fn options_of_a_newer_version_wait_for_a_worker_that_knows_them() {
     assert_eq!((&job["options"]["rows_per_bench"], &job["options"]["seed"]), (&json!(2), &json!(1)));
 
     let options = r#"{"of_tomorrow":7}"#.to_owned();
-    let request = JobRequest { plant, survey, options, priority: 0, max_attempts: 1 };
+    let request = JobRequest { id: JobId(uuid::Uuid::new_v4()), plant, survey, options, priority: 0, max_attempts: 1 };
     let Enqueued::New(job) = app.store.enqueue_job(&request, Timestamp::now()).await.unwrap() else {
         panic!("the other job has ended")
     };

@@ -160,6 +160,33 @@ async fn one_address_holds_so_many_connections() {
     assert!(answer.contains("\"ok\""), "{answer}");
 }
 
+/// A connection from an address of this machine that has asked and is held open; what came of it.
+async fn held(to: &str, from: &str) -> (TcpStream, usize) {
+    let socket = tokio::net::TcpSocket::new_v4().unwrap();
+    socket.bind(format!("{from}:0").parse().unwrap()).unwrap();
+    let mut stream = socket.connect(to.parse().unwrap()).await.unwrap();
+    let _ = stream.write_all(b"GET /health HTTP/1.1\r\nhost: localhost\r\n\r\n").await;
+    let mut answer = [0; 4096];
+    let count = stream.read(&mut answer).await.unwrap_or(0);
+    (stream, count)
+}
+
+#[tokio::test]
+async fn few_addresses_do_not_take_all_connections() {
+    let limits = Limits { max_connections: 12, max_connections_per_address: 11, ..Limits::default() };
+    let app = App::with_limits(&[], limits).await;
+    let address = app.base.strip_prefix("http://").unwrap().to_owned();
+    let mut greedy = Vec::new();
+    for _ in 0..11 {
+        greedy.push(held(&address, "127.0.0.1").await);
+    }
+    let served = greedy.iter().filter(|(_, count)| *count > 0).count();
+    assert_eq!(served, 4);
+    for other in ["127.0.0.2", "127.0.0.3"] {
+        assert!(held(&address, other).await.1 > 0, "{other}");
+    }
+}
+
 #[tokio::test]
 async fn connections_beyond_the_limit_wait_and_are_served_then() {
     let app = App::with_limits(&[], Limits { max_connections: 1, ..Limits::default() }).await;
@@ -235,6 +262,8 @@ async fn without_keys_pages_of_other_sites_get_nothing_done() {
         let request = from.iter().fold(request, |request, (name, value)| request.header(*name, *value));
         request.header("sec-fetch-site", "cross-site").body("{}").send()
     };
+    let old = app.request(Method::POST, &format!("{survey}/jobs")).header("origin", "https://evil.example").body("{}");
+    assert_problem(json_of(old.send().await.unwrap()).await, 403, "forbidden", "other sites");
     for from in [&[][..], &[("origin", "https://evil.example")]] {
         assert_problem(json_of(start(from).await.unwrap()).await, 403, "forbidden", "other sites");
     }
@@ -312,4 +341,56 @@ async fn metrics_tell_what_happened() {
     let bytes = metrics.lines().find_map(|line| line.strip_prefix("heliomap_upload_bytes_total ")).unwrap();
     assert!(bytes.parse::<u64>().unwrap() > 2 * jpeg(32, 24).len() as u64, "{bytes}");
     assert!(metrics.ends_with("# EOF\n"));
+}
+
+/// What the service sends first to a head that it is sent raw.
+async fn first_answer(app: &App, head: &str) -> String {
+    let mut stream = TcpStream::connect(app.base.trim_start_matches("http://")).await.unwrap();
+    stream.write_all(head.as_bytes()).await.unwrap();
+    let mut answer = vec![0; 8192];
+    let count = stream.read(&mut answer).await.unwrap();
+    String::from_utf8_lossy(&answer[..count]).into_owned()
+}
+
+#[tokio::test]
+async fn a_body_that_is_refused_already_is_not_asked_for() {
+    let app = App::with_limits(&[], Limits { max_image_size: 1000, ..Limits::default() }).await;
+    let survey = app.survey().await;
+    let expect = "host: localhost\r\nexpect: 100-continue\r\n";
+    let other = format!("{}0000", &survey[..survey.len() - 4]);
+    for (head, status) in [
+        (format!("PUT {survey}/images/a.jpg HTTP/1.1\r\n{expect}content-length: 2000\r\n\r\n"), "413"),
+        (format!("PUT {survey}/images/a.exe HTTP/1.1\r\n{expect}content-length: 10\r\n\r\n"), "422"),
+        (format!("PUT {other}/images/a.jpg HTTP/1.1\r\n{expect}content-length: 10\r\n\r\n"), "404"),
+        (format!("PUT {survey}/images/a.jpg HTTP/1.1\r\n{expect}if-match: *\r\ncontent-length: 10\r\n\r\n"), "412"),
+        (format!("PUT {survey}/reconstruction HTTP/1.1\r\n{expect}if-match: *\r\ncontent-length: 10\r\n\r\n"), "400"),
+        (
+            format!(
+                "POST /api/v1/plants HTTP/1.1\r\n{expect}content-type: application/json\r\ncontent-length: 9000000\r\n\r\n"
+            ),
+            "413",
+        ),
+        (format!("POST /api/v1/plants HTTP/1.1\r\n{expect}content-length: 10\r\n\r\n"), "415"),
+        // What may come is asked for.
+        (format!("PUT {survey}/images/a.jpg HTTP/1.1\r\n{expect}content-length: 10\r\n\r\n"), "100"),
+    ] {
+        let answer = first_answer(&app, &head).await;
+        assert!(answer.starts_with(&format!("HTTP/1.1 {status} ")), "{head}{answer}");
+    }
+}
+
+#[tokio::test]
+async fn heads_that_can_be_read_in_two_ways_are_refused() {
+    let app = App::new(&[]).await;
+    for (head, status) in [
+        ("GET /health HTTP/1.1\r\n\r\n", "400"),
+        ("GET /health HTTP/1.1\r\nhost: localhost\r\nhost: localhost\r\n\r\n", "400"),
+        ("POST /api/v1/plants HTTP/1.1\r\nhost: localhost\r\ntransfer-encoding: gzip, chunked\r\n\r\n0\r\n\r\n", "400"),
+        ("GET /health HTTP/1.1\r\nhost: localhost\r\n\r\n", "200"),
+        ("GET /health HTTP/1.0\r\n\r\n", "200"),
+    ] {
+        let answer = first_answer(&app, head).await;
+        let code = answer.split(' ').nth(1).unwrap_or_default();
+        assert_eq!(code, status, "{head}{answer}");
+    }
 }

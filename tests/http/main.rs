@@ -7,6 +7,7 @@ mod boxes;
 mod broken;
 mod conditions;
 mod contract;
+mod deletion;
 mod idempotency;
 mod images;
 mod jobs;

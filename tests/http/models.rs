@@ -120,3 +120,46 @@ async fn a_large_layer_is_streamed_whole() {
     let labels = labels(&whole);
     assert_eq!((labels.len(), labels[0], labels[5000]), (5001, "L01-B01-R1-001", "L01-B01-R1-5001"));
 }
+
+#[tokio::test]
+async fn a_plant_across_the_line_of_180_degrees_is_cut_there_and_found_there_alone() {
+    let app = App::new(&[Act::MapAcross(5)]).await;
+    let survey = app.complete_survey().await;
+    app.map(&survey).await;
+    let plant = plant_path(&survey);
+    for layer in ["modules", "sectors", "benches", "lines"] {
+        let (_, whole) = app.get(&format!("{plant}/models/latest/{layer}")).await;
+        let features = whole["features"].as_array().unwrap();
+        let cut = features.iter().filter(|feature| feature["geometry"]["type"] == "MultiPolygon");
+        let parts: Vec<_> = cut.map(|feature| feature["geometry"]["coordinates"].clone()).collect();
+        assert_eq!(parts.len(), 1, "{whole}");
+        for part in parts[0].as_array().unwrap() {
+            let ring = part[0].as_array().unwrap();
+            assert_eq!(ring.first(), ring.last());
+            let longitudes: Vec<f64> = ring.iter().map(|position| position[0].as_f64().unwrap()).collect();
+            let width = longitudes.iter().copied().fold(f64::MIN, f64::max)
+                - longitudes.iter().copied().fold(f64::MAX, f64::min);
+            assert!(width < 0.001, "{longitudes:?}");
+        }
+    }
+    let modules = format!("{plant}/models/latest/modules");
+    for (bbox, count) in [
+        ("8,-17,9,60", 0),
+        ("-180,49,-179.9,51", 5),
+        ("179.9,49,180,51", 1),
+        ("179.9,49,-179.9,51", 5),
+        ("-179.9,49,179.9,51", 0),
+        ("-180,-90,180,90", 5),
+        ("179.9,-90,-179.9,0", 0),
+    ] {
+        let (status, found) = app.get(&format!("{modules}?bbox={bbox}")).await;
+        assert_eq!((status, labels(&found).len()), (StatusCode::OK, count), "{bbox}");
+    }
+    let (_, first) = app.get(&format!("{modules}?bbox=179.9,49,-179.9,51&limit=2")).await;
+    let next = first["links"][0]["href"].as_str().unwrap();
+    let (_, second) = app.get(next).await;
+    assert_eq!((labels(&first).len(), labels(&second).len()), (2, 2), "{next}");
+    let (_, model) = app.get(&format!("{plant}/models/latest")).await;
+    let bbox: Vec<f64> = serde_json::from_value(model["layers"][0]["bbox"].clone()).unwrap();
+    assert!(bbox[0] > 179.9 && bbox[2] < -179.9, "{bbox:?}");
+}

@@ -395,3 +395,69 @@ async fn an_archive_may_be_in_pieces_that_are_one() {
         assert_eq!(status, StatusCode::OK, "{answer}");
     }
 }
+
+#[tokio::test]
+async fn archives_that_people_make_lose_nothing_silently() {
+    let app = App::new(&[]).await;
+    let photo = jpeg(8, 8);
+    // A program of Windows; a zip of macOS; photos in folders, one of them twice.
+    let entries: Vec<(&str, &[u8])> = vec![
+        ("flight\\reconstruction.json", RECONSTRUCTION),
+        ("flight\\reference_lla.json", REFERENCE),
+        ("flight\\undistorted\\depthmaps\\merged.ply", b"ply"),
+        ("flight\\images\\100MEDIA\\a.jpg", &photo),
+        ("flight\\images\\ho\u{308}he.jpg", &photo),
+        ("__MACOSX/flight/images/._a.jpg", b"x"),
+        ("flight/.DS_Store", b"x"),
+        ("flight/orthophoto.tif", b"x"),
+        ("flight/old/merged.ply", b"x"),
+        ("flight/notes.txt", b"x"),
+    ];
+    let cloud = stub::cloud(400);
+    let entries: Vec<(&str, &[u8])> =
+        entries.into_iter().map(|(name, bytes)| (name, if bytes == b"ply" { &cloud[..] } else { bytes })).collect();
+    let survey = app.survey().await;
+    let (status, answer) = app.put(&format!("{survey}/reconstruction"), zip(&entries)).await;
+    assert_eq!(status, StatusCode::OK, "{answer}");
+    let expected = [
+        "images/a.jpg",
+        "images/h\u{f6}he.jpg",
+        "reconstruction.json",
+        "reference_lla.json",
+        "undistorted/depthmaps/merged.ply",
+    ];
+    assert_eq!(paths(&app.get(&survey).await.1), expected);
+    let left_out: Vec<&str> =
+        answer["left_out"].as_array().unwrap().iter().map(|left_out| left_out["entry"].as_str().unwrap()).collect();
+    assert_eq!(left_out, ["flight/orthophoto.tif", "flight/old/merged.ply"], "{answer}");
+    assert_eq!(answer["ignored_count"], 5);
+
+    let twice = zip(&[("images/100MEDIA/a.jpg", &photo), ("images/101MEDIA/a.jpg", &photo)]);
+    let answer = app.put(&format!("{survey}/reconstruction"), twice).await;
+    assert_problem(answer, 422, "archive_unsafe", "`images/100MEDIA/a.jpg` and `images/101MEDIA/a.jpg`");
+    // Two entries of one name, as no writer makes them.
+    let mut same = zip(&[("reference_lla.json", REFERENCE), ("reference_llb.json", REFERENCE)]);
+    while let Some(at) = same.windows(18).position(|window| window == b"reference_llb.json") {
+        same[at + 12] = b'a';
+    }
+    let answer = app.put(&format!("{survey}/reconstruction"), same).await;
+    assert_problem(answer, 422, "archive_unsafe", "two entries are named `reference_lla.json`");
+}
+
+#[tokio::test]
+async fn names_that_differ_in_case_or_form_alone_are_one_where_that_is_clear() {
+    let app = App::new(&[]).await;
+    let survey = app.survey().await;
+    let reconstruction = stub::reconstruction_of(&[&["DJI_1.JPG", "ho\u{308}he.jpg", "DJI_2.jpg"]]);
+    assert_eq!(app.put(&format!("{survey}/reconstruction/reconstruction.json"), reconstruction).await.0.as_u16(), 201);
+    for name in ["dji_1.jpg", "h%C3%B6he.jpg", "Dji_2.jpg", "DJI_2.JPG"] {
+        assert_eq!(app.put(&format!("{survey}/images/{name}"), jpeg(8, 8)).await.0.as_u16(), 201, "{name}");
+    }
+    let (_, told) = app.get(&survey).await;
+    assert_eq!(told["images"]["not_uploaded"], json!(["DJI_2.jpg"]), "{told}");
+    assert_eq!(told["images"]["not_reconstructed"], json!([]));
+    // One plant, however its name is composed.
+    let (_, first) = app.post("/api/v1/plants", json!({"name": "Ho\u{308}he"})).await;
+    let (status, again) = app.post("/api/v1/plants", json!({"name": "H\u{f6}he"})).await;
+    assert_eq!((status, &again["id"]), (StatusCode::OK, &first["id"]));
+}

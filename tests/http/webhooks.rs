@@ -8,7 +8,7 @@ use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::post;
 use heliomap::config::Limits;
-use heliomap::store::{Created, Enqueued, JobRequest, NewWebhook, Quotas, SigningSecret};
+use heliomap::store::{Created, Enqueued, JobId, JobRequest, NewWebhook, Quotas, SigningSecret};
 use heliomap::telemetry::Metrics;
 use heliomap::webhooks::{HEADER, Sender, SenderSettings, Targets, sign};
 use jiff::{SignedDuration, Timestamp};
@@ -221,7 +221,14 @@ async fn slow_receivers_of_one_organisation_keep_no_other_waiting() {
         let (Created::New(survey) | Created::Existing(survey)) =
             app.store.create_survey(plant.id, "June", now).await.unwrap();
         let (options, survey) = ("{}".to_owned(), survey.id);
-        let request = JobRequest { plant: plant.id, survey, options, priority: 0, max_attempts: 1 };
+        let request = JobRequest {
+            id: JobId(uuid::Uuid::new_v4()),
+            plant: plant.id,
+            survey,
+            options,
+            priority: 0,
+            max_attempts: 1,
+        };
         let (Enqueued::New(job) | Enqueued::Existing(job)) = app.store.enqueue_job(&request, now).await.unwrap();
         app.store.cancel_job(plant.id, job.id, now).await.unwrap();
     }

@@ -470,3 +470,32 @@ fn metrics_are_told_on_a_listener_of_their_own() {
     assert!(answer.headers()["content-type"].to_str().unwrap().starts_with("application/openmetrics-text"));
     assert!(answer.text().unwrap().contains("heliomap_queue_depth 0"));
 }
+
+#[cfg(unix)]
+#[test]
+fn data_is_for_its_user_alone() {
+    use std::os::unix::fs::PermissionsExt;
+    let data = tempfile::tempdir().unwrap();
+    // As an earlier version left it.
+    std::fs::set_permissions(data.path(), std::fs::Permissions::from_mode(0o755)).unwrap();
+    let client = client();
+    let (_program, base) = serve(data.path(), &["--no-worker"]);
+    broken_survey_with_job(&client, &base);
+    let mut folders = vec![data.path().to_owned()];
+    let mut files = 0;
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(&folder).unwrap() {
+            let entry = entry.unwrap();
+            if entry.file_type().unwrap().is_dir() {
+                folders.push(entry.path());
+            } else {
+                files += 1;
+                let mode = entry.metadata().unwrap().permissions().mode();
+                assert_eq!(mode & 0o077, 0, "{}", entry.path().display());
+            }
+        }
+        let mode = std::fs::metadata(&folder).unwrap().permissions().mode();
+        assert_eq!(mode & 0o077, 0, "{}", folder.display());
+    }
+    assert!(files >= 4, "{files}");
+}

@@ -23,12 +23,13 @@ pub use tasks::*;
 pub use webhooks::*;
 
 use heliomap::store::{
-    Claim, Created, Digest, Enqueued, FileRecord, FileWritten, GeoBox, Job, JobRequest, JobState, NewFeature, NewLayer,
-    NewModel, OrganisationId, Page, Plant, Quotas, Store, StoreError, Survey, SurveyPath,
+    Claim, Created, Digest, Enqueued, FileRecord, FileWritten, GeoBox, Job, JobId, JobRequest, JobState, NewFeature,
+    NewLayer, NewModel, OrganisationId, Page, Plant, Quotas, Store, StoreError, Survey, SurveyPath,
 };
 use heliomap_model::{Layer, ModuleId, PlantId, Warning};
 use jiff::Timestamp;
 use std::time::Duration;
+use uuid::Uuid;
 
 const ORGANISATION: OrganisationId = OrganisationId::DEFAULT;
 const LEASE: Duration = Duration::from_secs(30);
@@ -51,8 +52,14 @@ async fn survey(store: &dyn Store, plant: PlantId, name: &str) -> Survey {
 }
 
 async fn enqueue(store: &dyn Store, survey: &Survey) -> Job {
-    let request =
-        JobRequest { plant: survey.plant, survey: survey.id, options: "{}".to_owned(), priority: 0, max_attempts: 2 };
+    let request = JobRequest {
+        id: JobId(Uuid::new_v4()),
+        plant: survey.plant,
+        survey: survey.id,
+        options: "{}".to_owned(),
+        priority: 0,
+        max_attempts: 2,
+    };
     match store.enqueue_job(&request, at(0)).await.unwrap() {
         Enqueued::New(job) => job,
         Enqueued::Existing(job) => panic!("there is an unfinished job: {job:?}"),

@@ -56,6 +56,8 @@ on_both!(
     plants_and_surveys,
     files_all_or_none,
     photos_and_what_was_found_in_them,
+    what_is_deleted_goes_and_models_say_so,
+    names_are_changed_where_they_are_free,
     uploads,
     one_unfinished_job_per_survey,
     jobs_of_one_plant_run_one_after_the_other,

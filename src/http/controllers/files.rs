@@ -8,10 +8,11 @@ use crate::http::error::{ApiError, Code, Problem};
 use crate::http::extract::ApiPath;
 use crate::http::middleware::conditional;
 use crate::http::state::AppState;
+use crate::http::uploads::form;
 use crate::http::uploads::intake::archive::{self, ArchiveError, LeftOut, Unpacked};
 use crate::http::uploads::intake::receive::{Bounds, drain, receive, waits_to_be_asked};
 use crate::http::uploads::intake::{self, Stored};
-use crate::store::{Content, FileWritten, ImageName, StagedFile, StoreError, SurveyId, SurveyPath};
+use crate::store::{Content, Digest, FileWritten, ImageName, StagedFile, StoreError, SurveyId, SurveyPath};
 use axum::Json;
 use axum::body::{Body, BodyDataStream};
 use axum::extract::multipart::{Field, MultipartError, MultipartRejection};
@@ -20,6 +21,7 @@ use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use heliomap_model::PlantId;
 use serde::Serialize;
+use std::collections::BTreeMap;
 use std::time::Duration;
 
 /// A file that was uploaded.
@@ -226,7 +228,7 @@ async fn receive_body(
     request_body(content = inline(PhotoForm), content_type = "multipart/form-data"),
     responses(
         (status = 200, description = "All stored", body = UploadedFiles),
-        (status = "4XX", description = "`plant_not_found`, `survey_not_found`, `files_refused`, `bad_request`, \
+        (status = "4XX", description = "`plant_not_found`, `survey_not_found`, `files_refused` (of its files also `name_twice`), `bad_request`, \
             `upload_interrupted`, `upload_stalled`, `unsupported_media_type`, `too_large`", body = Problem,
             content_type = "application/problem+json"),
         (status = 507, description = "`storage_full`, `quota_exceeded`", body = Problem, content_type = "application/problem+json")
@@ -249,11 +251,13 @@ pub async fn post_images(
     let mut files = Vec::new();
     let mut refused = Vec::new();
     let mut parts = 0;
+    // What came under each name.
+    let mut digests: BTreeMap<SurveyPath, Digest> = BTreeMap::new();
     let idle = state.limits.request_timeout;
     loop {
         let next = in_time(idle, form.next_field()).await;
         let Some(mut part) = next.map_err(|problem| so_far(problem, &files, &refused))? else { break };
-        let Some(name) = part.file_name().map(str::to_owned) else {
+        let Some(name) = form::file_name(part.headers()) else {
             skip(idle, &mut part).await.map_err(|problem| so_far(problem, &files, &refused))?;
             continue;
         };
@@ -264,8 +268,15 @@ pub async fn post_images(
         }
         let stored = async {
             let place = SurveyPath::of_image(&ImageName::parse(&name)?);
+            form::require_as_it_is(part.headers())?;
             let bounds = Bounds { name: place.as_str(), max_bytes: state.limits.max_image_size, idle };
             let staged = receive(&mut part, state.blobs.staging(), bounds).await?;
+            if digests.get(&place).is_some_and(|digest| *digest != staged.sha256) {
+                let what =
+                    format!("the form brought another file as {name} before, which was kept: give each its own name");
+                return Err(ApiError::new(Code::NameTwice, what));
+            }
+            digests.insert(place.clone(), staged.sha256);
             let checked = intake::check(&state, plant, place, staged).await?;
             intake::store(&state, plant, survey, vec![checked], None).await
         };

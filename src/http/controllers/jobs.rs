@@ -4,18 +4,20 @@ use crate::config::StartJob;
 use crate::http::controllers::surveys::missing_views;
 use crate::http::error::{ApiError, Code, Problem};
 use crate::http::extract::{ApiPath, ApiQuery, Object};
+use crate::http::middleware::idempotency::{KEPT, Once};
 use crate::http::paging::{List, filtered_list, state_filter};
 use crate::http::state::AppState;
 use crate::store::{Cancelled, Enqueued, Job, JobId, JobRequest, JobState, SurveyId};
-use axum::Json;
 use axum::body::Bytes;
 use axum::extract::State;
 use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
+use axum::{Extension, Json};
 use heliomap_mapping::pipeline::{MapOptions, Stage};
 use heliomap_model::{BenchId, PlantId, Warning};
 use jiff::Timestamp;
 use serde::Serialize;
+use uuid::Uuid;
 
 /// One mapping of a survey.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
@@ -202,6 +204,7 @@ fn place(plant: PlantId, job: JobId) -> String {
 pub async fn start(
     State(state): State<AppState>,
     ApiPath((plant, survey)): ApiPath<(PlantId, SurveyId)>,
+    once: Option<Extension<Once>>,
     body: Bytes,
 ) -> Result<Response, ApiError> {
     let asked = if body.trim_ascii().is_empty() {
@@ -219,12 +222,24 @@ pub async fn start(
         return Err(ApiError::new(Code::SurveyIncomplete, what.join("; ")).with("missing", missing));
     }
     let options = options.said();
-    let request = JobRequest { plant, survey, options, priority, max_attempts: state.limits.max_attempts };
-    let (status, job) = match state.store.enqueue_job(&request, Timestamp::now()).await? {
+    let now = Timestamp::now();
+    let id = match once {
+        Some(Extension(Once(id))) => {
+            let earlier = state.store.job(plant, JobId(id)).await?;
+            // A key is free again after a day.
+            earlier.is_none_or(|job| job.created > now - KEPT).then_some(JobId(id))
+        }
+        None => None,
+    };
+    let id = id.unwrap_or_else(|| JobId(Uuid::new_v4()));
+    let request = JobRequest { id, plant, survey, options, priority, max_attempts: state.limits.max_attempts };
+    let (status, job) = match state.store.enqueue_job(&request, now).await? {
         Enqueued::New(job) => {
             state.bell.notify_one();
             (StatusCode::ACCEPTED, job)
         }
+        // The service died before it could keep the answer to this very request.
+        Enqueued::Existing(job) if job.id == request.id => (StatusCode::ACCEPTED, job),
         Enqueued::Existing(job) if job.cancel_requested => {
             return Err(ApiError::new(
                 Code::JobStopping,

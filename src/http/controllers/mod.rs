@@ -2,6 +2,7 @@
 
 pub mod events;
 pub mod features;
+pub mod file_deletion;
 pub mod file_lists;
 pub mod files;
 pub mod health;

@@ -5,7 +5,7 @@ use crate::http::error::{ApiError, Code, Problem};
 use crate::http::extract::{ApiPath, ApiQuery};
 use crate::http::paging::{List, PageQuery};
 use crate::http::state::AppState;
-use crate::store::{JobId, Model, SurveyId};
+use crate::store::{GeoBox, JobId, Model, SurveyId};
 use axum::Json;
 use axum::extract::State;
 use heliomap_model::{Layer, PlantId};
@@ -60,13 +60,19 @@ pub struct LayerView {
     pub layer: &'static str,
     /// How many features it holds.
     pub features: u64,
-    /// West, south, east and north end, degrees.
+    /// West, south, east and north end, degrees; west is more than east across the line of 180 degrees.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<Vec<f64>>, min_items = 4, max_items = 4)]
     pub bbox: Option<[f64; 4]>,
     /// Where its GeoJSON is.
     #[schema(example = "/api/v1/plants/0b7a3f7e-59b1-4f0c-9f0d-3d6f3d1f7a11/models/1/modules")]
     pub href: String,
+}
+
+/// West, south, east and north; west is more than east where it crosses the line of 180 degrees (RFC 7946, 5.2).
+fn bbox(extent: GeoBox) -> [f64; 4] {
+    let east = if extent.max_lon > 180.0 { extent.max_lon - 360.0 } else { extent.max_lon };
+    [extent.min_lon, extent.min_lat, east, extent.max_lat]
 }
 
 /// The model that a path names: a version, or `latest`.
@@ -141,7 +147,7 @@ pub async fn get(
             layers.push(LayerView {
                 layer: layer.as_str(),
                 features: info.features,
-                bbox: info.extent.map(|extent| [extent.min_lon, extent.min_lat, extent.max_lon, extent.max_lat]),
+                bbox: info.extent.map(bbox),
                 href: format!("/api/v1/plants/{plant}/models/{}/{layer}", model.version),
             });
         }

@@ -139,6 +139,44 @@ pub async fn get(State(state): State<AppState>, ApiPath(plant): ApiPath<PlantId>
     Ok(Json(state.require_plant(plant).await?.into()))
 }
 
+/// What is changed of a plant or survey.
+#[derive(Debug, Deserialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Rename {
+    /// Its new name.
+    #[schema(min_length = 1, max_length = 200, example = "Sunfield South")]
+    pub name: String,
+}
+
+/// Rename a plant
+#[utoipa::path(
+    patch,
+    path = "/api/v1/plants/{plant}",
+    tag = "plants",
+    security(("key" = ["upload"])),
+    params(
+        ("plant" = Uuid, Path, description = "The plant's identifier"),
+        ("if-match" = Option<String>, Header, description = "Only as it was when it had one of these tags")
+    ),
+    request_body = Rename,
+    responses(
+        (status = 200, description = "Renamed", body = PlantView),
+        (status = 412, description = "`precondition_failed`", body = Problem, content_type = "application/problem+json"),
+        (status = "4XX", description = "`plant_not_found`, `name_taken`, `invalid_json`, `invalid_fields`, `invalid_name`, \
+            `unsupported_media_type`, `too_large`", body = Problem, content_type = "application/problem+json")
+    )
+)]
+pub async fn rename(
+    State(state): State<AppState>,
+    ApiPath(plant): ApiPath<PlantId>,
+    headers: HeaderMap,
+    ApiJson(wanted): ApiJson<Rename>,
+) -> Result<Json<PlantView>, ApiError> {
+    let name = checked_name(&wanted.name)?;
+    conditional::require(&headers, &PlantView::from(state.require_plant(plant).await?))?;
+    Ok(Json(state.store.rename_plant(plant, &name).await?.into()))
+}
+
 /// Delete a plant with its surveys, files, jobs and models
 ///
 /// A job that runs is stopped.

@@ -2,15 +2,17 @@
 
 use crate::http::controllers::file_lists::{check_warning, cursor_after, has_warning, path_of};
 use crate::http::controllers::images::{self, FileView, ImagesSummary};
-use crate::http::controllers::plants::{checked_name, created_answer};
+use crate::http::controllers::plants::{Rename, checked_name, created_answer};
 use crate::http::error::{ApiError, Code, Problem};
 use crate::http::extract::{ApiJson, ApiPath, ApiQuery};
+use crate::http::middleware::conditional;
 use crate::http::paging::{List, filtered_list, list_limit, next_link, next_part, prefix_filter, with_filters};
 use crate::http::state::AppState;
 use crate::jobs;
 use crate::store::{Created, FileKind, FileRecord, Survey, SurveyId};
 use axum::Json;
 use axum::extract::State;
+use axum::http::{HeaderMap, StatusCode};
 use axum::response::{IntoResponse, Response};
 use heliomap_model::PlantId;
 use jiff::Timestamp;
@@ -86,7 +88,7 @@ filtered_list!(
 );
 
 /// Which files of a survey are told.
-#[derive(Debug, Deserialize, utoipa::IntoParams)]
+#[derive(Debug, Default, Deserialize, utoipa::IntoParams)]
 #[serde(deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub struct FilesQuery {
@@ -231,11 +233,85 @@ pub async fn get(
 ) -> Result<Response, ApiError> {
     query.check()?;
     let survey = state.require_survey(plant, survey).await?;
+    let detail = detail(&state, survey, &query).await?;
+    let link = detail.next.as_deref().and_then(next_link).map(|link| [link]);
+    Ok((link, Json(detail)).into_response())
+}
+
+async fn detail(state: &AppState, survey: Survey, query: &FilesQuery) -> Result<SurveyDetail, ApiError> {
     let files = state.store.files(survey.id).await?;
     let missing = missing_views(&files);
     let (images, files) = images::summary(files);
-    let (files, next) = query.part(&format!("/api/v1/plants/{plant}/surveys/{}", survey.id), files)?;
-    let link = next.as_deref().and_then(next_link).map(|link| [link]);
-    let complete = missing.is_empty();
-    Ok((link, Json(SurveyDetail { survey: survey.into(), complete, missing, images, files, next })).into_response())
+    let (files, next) = query.part(&format!("/api/v1/plants/{}/surveys/{}", survey.plant, survey.id), files)?;
+    Ok(SurveyDetail { survey: survey.into(), complete: missing.is_empty(), missing, images, files, next })
+}
+
+/// Refuses a request that is about another state of a survey than its own.
+async fn require_state(state: &AppState, survey: Survey, headers: &HeaderMap) -> Result<(), ApiError> {
+    match conditional::is_asked(headers) {
+        true => conditional::require(headers, &detail(state, survey, &FilesQuery::default()).await?),
+        false => Ok(()),
+    }
+}
+
+/// Rename a survey
+#[utoipa::path(
+    patch,
+    path = "/api/v1/plants/{plant}/surveys/{survey}",
+    tag = "surveys",
+    security(("key" = ["upload"])),
+    params(
+        ("plant" = Uuid, Path, description = "The plant's identifier"),
+        ("survey" = Uuid, Path, description = "The survey's identifier"),
+        ("if-match" = Option<String>, Header, description = "Only as it was when it had one of these tags")
+    ),
+    request_body = Rename,
+    responses(
+        (status = 200, description = "Renamed", body = SurveyView),
+        (status = 412, description = "`precondition_failed`", body = Problem, content_type = "application/problem+json"),
+        (status = "4XX", description = "`plant_not_found`, `survey_not_found`, `name_taken`, `invalid_json`, `invalid_fields`, \
+            `invalid_name`, `unsupported_media_type`, `too_large`", body = Problem, content_type = "application/problem+json")
+    )
+)]
+pub async fn rename(
+    State(state): State<AppState>,
+    ApiPath((plant, survey)): ApiPath<(PlantId, SurveyId)>,
+    headers: HeaderMap,
+    ApiJson(wanted): ApiJson<Rename>,
+) -> Result<Json<SurveyView>, ApiError> {
+    let name = checked_name(&wanted.name)?;
+    require_state(&state, state.require_survey(plant, survey).await?, &headers).await?;
+    Ok(Json(state.store.rename_survey(survey, &name).await?.into()))
+}
+
+/// Delete a survey with its files, uploads and jobs
+///
+/// A job that runs is stopped. Models that were made from it stay, with the warning `source_deleted`.
+#[utoipa::path(
+    delete,
+    path = "/api/v1/plants/{plant}/surveys/{survey}",
+    tag = "surveys",
+    security(("key" = ["admin"])),
+    params(
+        ("plant" = Uuid, Path, description = "The plant's identifier"),
+        ("survey" = Uuid, Path, description = "The survey's identifier"),
+        ("if-match" = Option<String>, Header, description = "Only as it was when it had one of these tags")
+    ),
+    responses(
+        (status = 204, description = "Nothing of it is left but models"),
+        (status = 412, description = "`precondition_failed`", body = Problem, content_type = "application/problem+json"),
+        (status = 404, description = "`plant_not_found`, `survey_not_found`", body = Problem,
+            content_type = "application/problem+json")
+    )
+)]
+pub async fn delete(
+    State(state): State<AppState>,
+    ApiPath((plant, survey)): ApiPath<(PlantId, SurveyId)>,
+    headers: HeaderMap,
+) -> Result<StatusCode, ApiError> {
+    require_state(&state, state.require_survey(plant, survey).await?, &headers).await?;
+    for upload in state.store.delete_survey(survey, Timestamp::now()).await?.unwrap_or_default() {
+        state.blobs.drop_upload(upload).await;
+    }
+    Ok(StatusCode::NO_CONTENT)
 }

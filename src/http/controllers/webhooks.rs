@@ -4,14 +4,15 @@ use crate::http::error::{ApiError, Code, Problem};
 use crate::http::extract::{ApiJson, ApiPath, ApiQuery};
 use crate::http::middleware::access::Caller;
 use crate::http::middleware::conditional;
+use crate::http::middleware::idempotency::Once;
 use crate::http::paging::{List, PageQuery, filtered_list, state_filter};
 use crate::http::state::AppState;
 use crate::store::webhooks::MAX_WEBHOOKS;
 use crate::store::{Delivery, DeliveryId, DeliveryState, JobId, NewWebhook, SigningSecret, Webhook, WebhookId};
-use axum::Json;
 use axum::extract::State;
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
+use axum::{Extension, Json};
 use heliomap_model::PlantId;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -298,10 +299,12 @@ pub async fn deliveries(
 pub async fn resend(
     State(state): State<AppState>,
     caller: Caller,
+    once: Option<Extension<Once>>,
     ApiPath((id, delivery)): ApiPath<(WebhookId, DeliveryId)>,
 ) -> Result<Response, ApiError> {
     let webhook = require_webhook(&state, &caller, id).await?;
-    let found = state.store.resend_delivery(webhook.id, delivery, Timestamp::now()).await?.ok_or_else(|| {
+    let once = once.map(|Extension(Once(id))| id);
+    let found = state.store.resend_delivery(webhook.id, delivery, once, Timestamp::now()).await?.ok_or_else(|| {
         let detail = format!(
             "no message to this webhook has the identifier {delivery}; GET /api/v1/webhooks/{id}/deliveries lists them"
         );

@@ -30,11 +30,16 @@ const REPLAYED: HeaderName = HeaderName::from_static("idempotency-replayed");
 /// Longest key, bytes.
 const MAX_KEY: usize = 255;
 /// How long an answer is kept.
-const KEPT: SignedDuration = SignedDuration::from_hours(24);
+pub const KEPT: SignedDuration = SignedDuration::from_hours(24);
 /// How long a key is taken by a request that is not answered, because the service died over it say.
 const TAKEN: SignedDuration = SignedDuration::from_mins(2);
 /// Largest answer that is kept.
 const MAX_ANSWER_BYTES: usize = 16 << 20;
+
+/// What the first thing that a request under a key makes is identified by, so that the same request makes it once, though the
+/// service dies before its answer is kept.
+#[derive(Debug, Clone, Copy)]
+pub struct Once(pub Uuid);
 
 /// Whether the answers of an operation hold a secret, which is kept nowhere.
 fn tells_secret(path: &str) -> bool {
@@ -85,7 +90,9 @@ async fn answer_once(
 ) -> Result<Response, ApiError> {
     let (now, token) = (Timestamp::now(), Uuid::new_v4());
     let begun = state.store.begin_request(organisation, key, token, now, now + TAKEN).await?;
-    let (parts, body) = request.into_parts();
+    let (mut parts, body) = request.into_parts();
+    let name = format!("{organisation} {} {key}", parts.uri.path());
+    parts.extensions.insert(Once(Uuid::new_v5(&Uuid::NAMESPACE_URL, name.as_bytes())));
     let told = Told::new(&parts.method, &parts.uri.to_string(), &parts.headers, body);
     match begun {
         Begun::Running => {

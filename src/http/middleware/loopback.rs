@@ -41,7 +41,7 @@ fn changes(method: &Method) -> bool {
     !matches!(*method, Method::GET | Method::HEAD | Method::OPTIONS)
 }
 
-/// Whether a browser says that a page of another site sends a request, and not one that is let in. Old ones tell the page's
+/// Whether a browser says that a page of another site sends a request, and not one that is let in. Old ones send the page's
 /// origin alone.
 fn is_cross_site(headers: &HeaderMap, network: &NetworkArgs) -> bool {
     let origin = headers.get(header::ORIGIN);

@@ -3,7 +3,7 @@
 use super::super::{Row, Rows, Tx, notify_workers};
 use super::announcement::announce;
 use super::columns::{document, optional_small, optional_time, parsed, small, time, uuid};
-use super::models::insert_model;
+use super::models::{is_claimed, publish_model};
 use super::{after, gone, usage};
 use crate::store::error::StoreError;
 use crate::store::ids::{JobId, SurveyId};
@@ -19,7 +19,6 @@ use heliomap_model::PlantId;
 use jiff::Timestamp;
 use sqlx::Row as _;
 use std::time::Duration;
-use uuid::Uuid;
 
 macro_rules! job_columns {
     () => {
@@ -27,8 +26,6 @@ macro_rules! job_columns {
          error_message, attempt, max_attempts, fence, cancel_requested, model_version, created_ms, started_ms, finished_ms"
     };
 }
-
-pub const IS_CLAIMED: &str = "SELECT 1 FROM jobs WHERE id = $1 AND fence = $2 AND state = 'running'";
 
 pub const CHECKPOINT: &str = "\
     INSERT INTO checkpoints (job_id, name, fingerprint, document) VALUES ($1, $2, $3, $4) \
@@ -48,8 +45,13 @@ impl JobStore for Rows {
         const UNFINISHED_JOB: &str =
             concat!("SELECT ", job_columns!(), " FROM jobs WHERE survey_id = $1 AND state IN ('queued', 'running')");
         let mut tx = self.begin_alone().await?;
+        let again = sqlx::query(JOB).bind(request.plant.to_string()).bind(request.id.to_string());
+        if let Some(row) = again.fetch_optional(&mut *tx).await? {
+            tx.commit().await?;
+            return Ok(Enqueued::Existing(job(&row)?));
+        }
         let row = sqlx::query(ENQUEUE_JOB)
-            .bind(Uuid::new_v4().to_string())
+            .bind(request.id.to_string())
             .bind(request.plant.to_string())
             .bind(request.survey.to_string())
             .bind(&request.options)
@@ -288,13 +290,13 @@ impl JobStore for Rows {
             UPDATE jobs SET state = 'succeeded', finished_ms = $3, claim_expires_ms = NULL, warnings = $4, \
             model_version = $5, error_code = NULL, error_message = NULL, remaining_ms = NULL, stage_ms = $6 \
             WHERE id = $1 AND fence = $2 AND state = 'running'";
+        let Some(staged) = self.stage_model(claim, new, now).await? else { return Ok(Completed::Fenced) };
         let mut tx = self.begin().await?;
-        let query = sqlx::query(IS_CLAIMED).bind(claim.job.id.to_string()).bind(claim.fence);
-        if query.fetch_optional(&mut *tx).await?.is_none() {
+        if !is_claimed(&mut tx, claim).await? {
             tx.rollback().await?;
             return Ok(Completed::Fenced);
         }
-        let Some(stored) = insert_model(&mut tx, claim, new, now).await? else {
+        let Some(stored) = publish_model(&mut tx, staged, new).await? else {
             tx.rollback().await?;
             return Ok(Completed::Outdated);
         };

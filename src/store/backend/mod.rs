@@ -89,6 +89,14 @@ fn after(now: Timestamp, lease: Duration) -> i64 {
     now.as_millisecond().saturating_add(i64::try_from(lease.as_millis()).unwrap_or(i64::MAX))
 }
 
+/// Where a name that must differ is another row's already.
+fn name_taken(error: sqlx::Error) -> StoreError {
+    match &error {
+        sqlx::Error::Database(database) if database.is_unique_violation() => StoreError::NameTaken,
+        _ => StoreError::Database(error),
+    }
+}
+
 /// A row whose owner was deleted meanwhile cannot be written.
 fn gone(what: &'static str) -> impl FnOnce(sqlx::Error) -> StoreError {
     move |error| match &error {

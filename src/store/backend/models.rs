@@ -28,13 +28,16 @@ const SMALL_BOX_SHARE: f64 = 0.05;
 /// 65,535.
 const FEATURES_AT_ONCE: usize = 500;
 
+/// Features that one transaction inserts: some 30 ms, in which nobody else writes to an SQLite file.
+const FEATURES_OF_PART: usize = 2000;
+
 #[async_trait]
 impl ModelStore for Rows {
     async fn models(&self, plant: PlantId, page: Page) -> Result<Vec<Model>, StoreError> {
         const MODELS: &str = concat!(
             "SELECT ",
             model_columns!(),
-            " FROM models WHERE plant_id = $1 AND seq < $2 ORDER BY seq DESC LIMIT $3"
+            " FROM models WHERE plant_id = $1 AND seq < $2 AND version > 0 ORDER BY seq DESC LIMIT $3"
         );
         let query = sqlx::query(MODELS)
             .bind(plant.to_string())
@@ -45,8 +48,11 @@ impl ModelStore for Rows {
 
     async fn model(&self, plant: PlantId, version: Option<u32>) -> Result<Option<Model>, StoreError> {
         const MODEL: &str = concat!("SELECT ", model_columns!(), " FROM models WHERE plant_id = $1 AND version = $2");
-        const NEWEST_MODEL: &str =
-            concat!("SELECT ", model_columns!(), " FROM models WHERE plant_id = $1 ORDER BY version DESC LIMIT 1");
+        const NEWEST_MODEL: &str = concat!(
+            "SELECT ",
+            model_columns!(),
+            " FROM models WHERE plant_id = $1 AND version > 0 ORDER BY version DESC LIMIT 1"
+        );
         let query = match version {
             Some(version) => sqlx::query(MODEL).bind(plant.to_string()).bind(i64::from(version)),
             None => sqlx::query(NEWEST_MODEL).bind(plant.to_string()),
@@ -100,7 +106,7 @@ impl ModelStore for Rows {
     async fn module_last_seen(&self, plant: PlantId, id: ModuleId) -> Result<Option<u32>, StoreError> {
         const MODULE_LAST_SEEN: &str = "\
             SELECT models.version FROM features JOIN models ON models.seq = features.model_seq \
-            WHERE features.id = $1 AND features.layer = 'modules' AND models.plant_id = $2 ORDER BY models.version DESC LIMIT 1";
+            WHERE features.id = $1 AND features.layer = 'modules' AND models.plant_id = $2 AND models.version > 0 ORDER BY models.version DESC LIMIT 1";
         let query = sqlx::query_scalar(MODULE_LAST_SEEN).bind(id.to_string()).bind(plant.to_string());
         let version: Option<i64> = query.fetch_optional(&self.read).await?;
         version.map(|version| small("version", version)).transpose()
@@ -146,10 +152,13 @@ impl Rows {
         if let Some(within) = page.within {
             query = query.bind(within.min_lon).bind(within.min_lat).bind(within.max_lon).bind(within.max_lat);
             if let Some(extent) = layer.extent.filter(|extent| is_small(within, *extent)) {
+                // Features east of the line of 180 degrees begin at -180 again.
+                let [west, east] =
+                    if extent.max_lon > 180.0 { [-180.0, 180.0] } else { [extent.min_lon, extent.max_lon] };
                 query = query
                     .bind(within.min_lat - layer.tallest_deg)
-                    .bind(strip((within.min_lon - layer.widest_deg).max(extent.min_lon)))
-                    .bind(strip(within.max_lon.min(extent.max_lon)));
+                    .bind(strip((within.min_lon - layer.widest_deg).max(west)))
+                    .bind(strip(within.max_lon.min(east)));
             }
         }
         let rows = query.fetch_all(&self.read).await?;
@@ -157,35 +166,82 @@ impl Rows {
     }
 }
 
-/// Inserts the model of a claimed job with its layers; `None` where the plant has that version already.
-pub async fn insert_model(
-    tx: &mut Tx,
-    claim: &Claim,
-    new: &NewModel,
-    now: Timestamp,
-) -> Result<Option<Model>, StoreError> {
-    const INSERT_MODEL: &str = concat!(
-        "INSERT INTO models (plant_id, version, survey_id, job_id, sha256, size, warnings, created_ms) \
-         VALUES ($1, $2, $3, $4, $5, $6, $7, $8) ON CONFLICT (plant_id, version) DO NOTHING RETURNING ",
+impl Rows {
+    /// Stores the model of a claimed job part by part where nobody sees it yet, so that others write in between; `None` where
+    /// the claim is lost. Its version is below zero until [`publish_model`]; what a job left that ended otherwise is deleted
+    /// with the next.
+    pub(super) async fn stage_model(
+        &self,
+        claim: &Claim,
+        new: &NewModel,
+        now: Timestamp,
+    ) -> Result<Option<i64>, StoreError> {
+        const FORGET_STAGED: &str = "\
+            DELETE FROM models WHERE version < 0 \
+            AND (job_id = $1 OR NOT EXISTS (SELECT 1 FROM jobs WHERE jobs.id = models.job_id AND jobs.state = 'running'))";
+        const STAGE_MODEL: &str = "\
+            INSERT INTO models (plant_id, version, survey_id, job_id, sha256, size, warnings, created_ms) \
+            VALUES ($1, $2, $3, $4, $5, $6, $7, $8) RETURNING seq";
+        let mut tx = self.begin().await?;
+        if !is_claimed(&mut tx, claim).await? {
+            tx.rollback().await?;
+            return Ok(None);
+        }
+        sqlx::query(FORGET_STAGED).bind(claim.job.id.to_string()).execute(&mut *tx).await?;
+        let seq: i64 = sqlx::query_scalar(STAGE_MODEL)
+            .bind(claim.job.plant.to_string())
+            .bind(-claim.job.seq)
+            .bind(claim.job.survey.to_string())
+            .bind(claim.job.id.to_string())
+            .bind(new.sha256.to_string())
+            .bind(new.size as i64)
+            .bind(serde_json::json!(new.warnings).to_string())
+            .bind(now.as_millisecond())
+            .fetch_one(&mut *tx)
+            .await?;
+        for layer in &new.layers {
+            insert_layer(&mut tx, seq, layer).await?;
+        }
+        tx.commit().await?;
+        for layer in &new.layers {
+            let mut first = 1;
+            for part in layer.features.chunks(FEATURES_OF_PART) {
+                let mut tx = self.begin().await?;
+                if !is_claimed(&mut tx, claim).await? {
+                    tx.rollback().await?;
+                    return Ok(None);
+                }
+                for features in part.chunks(FEATURES_AT_ONCE) {
+                    insert_features(&mut tx, seq, layer.layer, first, features).await?;
+                    first += features.len() as i64;
+                }
+                tx.commit().await?;
+            }
+        }
+        Ok(Some(seq))
+    }
+}
+
+/// Whether a worker has its job still.
+pub async fn is_claimed(tx: &mut Tx, claim: &Claim) -> Result<bool, StoreError> {
+    const IS_CLAIMED: &str = "SELECT 1 FROM jobs WHERE id = $1 AND fence = $2 AND state = 'running'";
+    let query = sqlx::query(IS_CLAIMED).bind(claim.job.id.to_string()).bind(claim.fence);
+    Ok(query.fetch_optional(&mut **tx).await?.is_some())
+}
+
+/// Gives a staged model its version, by which it is seen; `None` where the plant has that version already.
+pub async fn publish_model(tx: &mut Tx, seq: i64, new: &NewModel) -> Result<Option<Model>, StoreError> {
+    const PUBLISH_MODEL: &str = concat!(
+        "UPDATE models SET version = $2 WHERE seq = $1 AND NOT EXISTS (SELECT 1 FROM models AS other \
+         WHERE other.plant_id = models.plant_id AND other.version = $2) RETURNING ",
         model_columns!()
     );
-    let row = sqlx::query(INSERT_MODEL)
-        .bind(claim.job.plant.to_string())
-        .bind(i64::from(new.version))
-        .bind(claim.job.survey.to_string())
-        .bind(claim.job.id.to_string())
-        .bind(new.sha256.to_string())
-        .bind(new.size as i64)
-        .bind(serde_json::json!(new.warnings).to_string())
-        .bind(now.as_millisecond())
-        .fetch_optional(&mut **tx)
-        .await?;
-    let Some(row) = row else { return Ok(None) };
-    let stored = model(&row)?;
-    for layer in &new.layers {
-        insert_layer(tx, stored.seq, layer).await?;
+    let query = sqlx::query(PUBLISH_MODEL).bind(seq).bind(i64::from(new.version));
+    match query.fetch_optional(&mut **tx).await {
+        // Another worker gives its model this version at the same moment.
+        Err(sqlx::Error::Database(error)) if error.is_unique_violation() => Ok(None),
+        row => row?.as_ref().map(model).transpose(),
     }
-    Ok(Some(stored))
 }
 
 async fn insert_layer(tx: &mut Tx, model_seq: i64, layer: &NewLayer) -> Result<(), StoreError> {
@@ -193,7 +249,7 @@ async fn insert_layer(tx: &mut Tx, model_seq: i64, layer: &NewLayer) -> Result<(
         INSERT INTO layers (model_seq, layer, features, properties, min_lon, min_lat, max_lon, max_lat, tallest_deg, \
         widest_deg) VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10)";
     let extents = || layer.features.iter().filter_map(|feature| feature.extent);
-    let extent = extents().reduce(GeoBox::union);
+    let extent = GeoBox::around_all(extents());
     sqlx::query(INSERT_LAYER)
         .bind(model_seq)
         .bind(layer.layer.as_str())
@@ -207,11 +263,6 @@ async fn insert_layer(tx: &mut Tx, model_seq: i64, layer: &NewLayer) -> Result<(
         .bind(extents().map(GeoBox::width_deg).fold(0.0, f64::max))
         .execute(&mut **tx)
         .await?;
-    let mut first = 1;
-    for features in layer.features.chunks(FEATURES_AT_ONCE) {
-        insert_features(tx, model_seq, layer.layer, first, features).await?;
-        first += features.len() as i64;
-    }
     Ok(())
 }
 

@@ -2,7 +2,7 @@
 
 use super::super::{Row, Rows};
 use super::columns::{time, uuid};
-use super::{gone, usage};
+use super::{gone, name_taken, usage};
 use crate::store::error::StoreError;
 use crate::store::ids::OrganisationId;
 use crate::store::listing::{Created, Page};
@@ -93,6 +93,13 @@ impl PlantStore for Rows {
             .bind(i64::from(page.limit))
             .bind(prefix);
         query.fetch_all(&self.read).await?.iter().map(plant).collect()
+    }
+
+    async fn rename_plant(&self, id: PlantId, name: &str) -> Result<Plant, StoreError> {
+        const RENAME_PLANT: &str = concat!("UPDATE plants SET name = $2 WHERE id = $1 RETURNING ", plant_columns!());
+        let query = sqlx::query(RENAME_PLANT).bind(id.to_string()).bind(name);
+        let row = query.fetch_optional(&self.write).await.map_err(name_taken)?;
+        plant(&row.ok_or(StoreError::Gone { what: "plant" })?)
     }
 
     async fn delete_plant(&self, id: PlantId, now: Timestamp) -> Result<bool, StoreError> {

@@ -1,16 +1,16 @@
 //! Surveys and their files.
 
 use super::super::{Row, Rows, Tx};
-use super::columns::{optional_document, optional_small, parsed, time, uuid};
-use super::{gone, usage};
+use super::columns::{document, optional_document, optional_small, parsed, time, uuid};
+use super::{gone, name_taken, usage};
 use crate::store::digest::Digest;
 use crate::store::error::StoreError;
-use crate::store::ids::SurveyId;
+use crate::store::ids::{SurveyId, UploadId};
 use crate::store::listing::{Created, Page};
 use crate::store::survey_path::SurveyPath;
-use crate::store::surveys::{FileRecord, FileWritten, Survey, SurveyStore, Wanted};
+use crate::store::surveys::{FileDeleted, FileRecord, FileWritten, Survey, SurveyStore, Wanted};
 use async_trait::async_trait;
-use heliomap_model::PlantId;
+use heliomap_model::{PlantId, Warning};
 use jiff::Timestamp;
 use sqlx::Row as _;
 use uuid::Uuid;
@@ -75,6 +75,61 @@ impl SurveyStore for Rows {
             .bind(i64::from(page.limit))
             .bind(prefix);
         query.fetch_all(&self.read).await?.iter().map(survey).collect()
+    }
+
+    async fn rename_survey(&self, id: SurveyId, name: &str) -> Result<Survey, StoreError> {
+        const RENAME_SURVEY: &str = concat!("UPDATE surveys SET name = $2 WHERE id = $1 RETURNING ", survey_columns!());
+        let query = sqlx::query(RENAME_SURVEY).bind(id.to_string()).bind(name);
+        let row = query.fetch_optional(&self.write).await.map_err(name_taken)?;
+        survey(&row.ok_or(StoreError::Gone { what: "survey" })?)
+    }
+
+    async fn delete_survey(&self, id: SurveyId, now: Timestamp) -> Result<Option<Vec<UploadId>>, StoreError> {
+        const UPLOADS_OF_SURVEY: &str = "SELECT id FROM uploads WHERE survey_id = $1";
+        const DELETE_SURVEY: &str = "DELETE FROM surveys WHERE id = $1";
+        let mut tx = self.begin().await?;
+        let plant = match usage::lock_plant_of(&mut tx, id).await {
+            Err(StoreError::Gone { .. }) => {
+                tx.rollback().await?;
+                return Ok(None);
+            }
+            locked => locked?,
+        };
+        let rows = sqlx::query(UPLOADS_OF_SURVEY).bind(id.to_string()).fetch_all(&mut *tx).await?;
+        let uploads: Result<Vec<_>, StoreError> = rows.iter().map(|row| Ok(UploadId(uuid(row, "id")?))).collect();
+        sqlx::query(DELETE_SURVEY).bind(id.to_string()).execute(&mut *tx).await?;
+        usage::remove_lost_blob_refs(&mut tx, plant, now).await?;
+        warn_models(&mut tx, id, None).await?;
+        tx.commit().await?;
+        uploads.map(Some)
+    }
+
+    async fn delete_file(
+        &self,
+        survey: SurveyId,
+        path: &SurveyPath,
+        wanted: Option<&Wanted>,
+        now: Timestamp,
+    ) -> Result<FileDeleted, StoreError> {
+        const DELETE_FILE: &str = "DELETE FROM files WHERE survey_id = $1 AND path = $2";
+        let mut tx = self.begin().await?;
+        let plant = usage::lock_plant_of(&mut tx, survey).await?;
+        let query = sqlx::query_scalar(FILE_DIGEST).bind(survey.to_string()).bind(path.as_str());
+        let digest: Option<String> = query.fetch_optional(&mut *tx).await?;
+        let is_other =
+            wanted.is_some_and(|wanted| !wanted.holds(digest.as_deref().and_then(|digest| digest.parse().ok())));
+        let outcome = match digest {
+            _ if is_other => FileDeleted::Other,
+            None => FileDeleted::Absent,
+            Some(digest) => {
+                sqlx::query(DELETE_FILE).bind(survey.to_string()).bind(path.as_str()).execute(&mut *tx).await?;
+                usage::remove_blob_ref(&mut tx, plant, &digest, now).await?;
+                warn_models(&mut tx, survey, Some(path)).await?;
+                FileDeleted::Deleted
+            }
+        };
+        tx.commit().await?;
+        Ok(outcome)
     }
 
     async fn put_files(&self, survey: SurveyId, files: &[FileRecord]) -> Result<Vec<FileWritten>, StoreError> {
@@ -158,6 +213,33 @@ impl SurveyStore for Rows {
     }
 }
 
+const FILE_DIGEST: &str = "SELECT sha256 FROM files WHERE survey_id = $1 AND path = $2";
+
+/// Most files that a warning of a model names.
+const MAX_WARNED: usize = 100;
+
+/// Adds to the warnings of the models that were made from a survey that a file of it, or all of it, was deleted since.
+async fn warn_models(tx: &mut Tx, survey: SurveyId, path: Option<&SurveyPath>) -> Result<(), StoreError> {
+    const CODE: &str = "source_deleted";
+    const WARNINGS_OF_MODELS: &str = "SELECT seq, warnings FROM models WHERE survey_id = $1";
+    const SET_WARNINGS: &str = "UPDATE models SET warnings = $2 WHERE seq = $1";
+    for row in sqlx::query(WARNINGS_OF_MODELS).bind(survey.to_string()).fetch_all(&mut **tx).await? {
+        let mut warnings: Vec<Warning> = document(&row, "warnings")?;
+        let earlier = warnings.iter().position(|warning| warning.code == CODE);
+        let mut names = earlier.map(|at| warnings.remove(at).images).unwrap_or_default();
+        names.extend(path.map(|path| path.file_name().to_owned()).filter(|_| names.len() < MAX_WARNED));
+        let message = match path {
+            None => "the survey that it was made from was deleted since".to_owned(),
+            Some(_) => format!("files that it was made from were deleted since: {}", names.join(", ")),
+        };
+        warnings.push(Warning::new(CODE, message, names));
+        let seq: i64 = row.try_get("seq")?;
+        let query = sqlx::query(SET_WARNINGS).bind(seq).bind(serde_json::json!(warnings).to_string());
+        query.execute(&mut **tx).await?;
+    }
+    Ok(())
+}
+
 /// Stores the record of a file if the existing one meets a precondition. The caller has locked the plant's row.
 async fn put_file(
     tx: &mut Tx,
@@ -166,7 +248,6 @@ async fn put_file(
     file: &FileRecord,
     wanted: Option<&Wanted>,
 ) -> Result<Option<FileWritten>, StoreError> {
-    const FILE_DIGEST: &str = "SELECT sha256 FROM files WHERE survey_id = $1 AND path = $2";
     /// Adds metadata that older versions did not read.
     const COMPLETE_FILE: &str = "\
         UPDATE files SET photo = $3, shots = $4 WHERE survey_id = $1 AND path = $2 AND photo IS NULL AND shots IS NULL";

@@ -3,7 +3,8 @@
 use super::super::{Db, Rows, notify_workers};
 use super::after;
 use super::columns::uuid;
-use super::jobs::{CHECKPOINT, IS_CLAIMED};
+use super::jobs::CHECKPOINT;
+use super::models::is_claimed;
 use crate::store::error::StoreError;
 use crate::store::ids::JobId;
 use crate::store::jobs::{Checkpoint, Claim};
@@ -32,8 +33,7 @@ impl TaskStore for Rows {
         const OFFER_TASKS: &str = "INSERT INTO image_tasks (job_id, image, position, fingerprint, mapper, document) ";
         let mut tx = self.begin_alone().await?;
         let job = claim.job.id.to_string();
-        let held = sqlx::query(IS_CLAIMED).bind(&job).bind(claim.fence).fetch_optional(&mut *tx).await?;
-        if held.is_none() {
+        if !is_claimed(&mut tx, claim).await? {
             tx.rollback().await?;
             return Ok(false);
         }

@@ -281,6 +281,15 @@ pub async fn remove_blob_ref(tx: &mut Tx, plant: PlantId, digest: &str, now: Tim
     Ok(())
 }
 
+/// As [`remove_blob_ref`], of all blobs of a plant whose rows went with another.
+pub async fn remove_lost_blob_refs(tx: &mut Tx, plant: PlantId, now: Timestamp) -> Result<(), StoreError> {
+    const REMOVE_LOST_BLOB_REFS: &str =
+        concat!("UPDATE blobs SET unused_ms = $2 WHERE plant_id = $1 AND unused_ms IS NULL AND ", is_unreferenced!());
+    let query = sqlx::query(REMOVE_LOST_BLOB_REFS).bind(plant.to_string()).bind(now.as_millisecond());
+    query.execute(&mut **tx).await?;
+    Ok(())
+}
+
 fn usage(row: &Row) -> Result<Usage, StoreError> {
     let count = |column: &str| Ok::<_, StoreError>(row.try_get::<i64, _>(column)? as u64);
     let quota = |column: &str| Ok::<_, StoreError>(row.try_get::<Option<i64>, _>(column)?.map(|quota| quota as u64));

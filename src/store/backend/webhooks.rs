@@ -12,7 +12,7 @@ use crate::store::webhooks::{
 };
 use async_trait::async_trait;
 use heliomap_model::PlantId;
-use jiff::Timestamp;
+use jiff::{SignedDuration, Timestamp};
 use sqlx::Row as _;
 use std::time::Duration;
 use uuid::Uuid;
@@ -28,6 +28,9 @@ macro_rules! delivery_columns {
         "seq, id, webhook_id, job_id, state, attempts, attempts_left, run_after_ms, error, created_ms, finished_ms"
     };
 }
+
+/// How long it is known that a message was sent again under an identifier.
+const ONCE_KEPT: SignedDuration = SignedDuration::from_hours(24);
 
 #[async_trait]
 impl WebhookStore for Rows {
@@ -108,6 +111,7 @@ impl WebhookStore for Rows {
         &self,
         webhook: WebhookId,
         id: DeliveryId,
+        once: Option<Uuid>,
         now: Timestamp,
     ) -> Result<Option<Delivery>, StoreError> {
         const RESEND_DELIVERY: &str = concat!(
@@ -115,12 +119,31 @@ impl WebhookStore for Rows {
              WHERE webhook_id = $1 AND id = $2 RETURNING ",
             delivery_columns!()
         );
+        const DELIVERY: &str =
+            concat!("SELECT ", delivery_columns!(), " FROM deliveries WHERE webhook_id = $1 AND id = $2");
+        /// A name with a space is no client's.
+        const NOTE_ONCE: &str = "\
+            INSERT INTO requests (organisation_id, name, expires_ms) SELECT organisation_id, $2, $3 FROM webhooks WHERE id = $1 \
+            ON CONFLICT (organisation_id, name) DO NOTHING";
+        let mut tx = self.begin().await?;
+        if let Some(once) = once {
+            let query = sqlx::query(NOTE_ONCE).bind(webhook.to_string()).bind(format!("once {once}"));
+            let noted = query.bind((now + ONCE_KEPT).as_millisecond()).execute(&mut *tx).await?;
+            if noted.rows_affected() == 0 {
+                let query = sqlx::query(DELIVERY).bind(webhook.to_string()).bind(id.to_string());
+                let found = query.fetch_optional(&mut *tx).await?.as_ref().map(delivery).transpose()?;
+                tx.commit().await?;
+                return Ok(found);
+            }
+        }
         let query = sqlx::query(RESEND_DELIVERY)
             .bind(webhook.to_string())
             .bind(id.to_string())
             .bind(now.as_millisecond())
             .bind(i64::from(MAX_ATTEMPTS));
-        query.fetch_optional(&self.write).await?.as_ref().map(delivery).transpose()
+        let found = query.fetch_optional(&mut *tx).await?.as_ref().map(delivery).transpose()?;
+        tx.commit().await?;
+        Ok(found)
     }
 
     async fn claim_delivery(

@@ -1,10 +1,12 @@
 //! Files of surveys, and how they come.
 
-use super::{LEASE, at, claim, enqueue, file, model, plant, put, reserve, survey};
+use super::{ALL, LEASE, at, claim, enqueue, file, model, plant, put, reserve, survey};
 use heliomap::store::{
-    Digest, FileRecord, FileWritten, Piece, Store, StoreError, SurveyId, SurveyPath, Upload, UploadId, Wanted,
+    Digest, FileDeleted, FileRecord, FileWritten, Heartbeat, Piece, Store, StoreError, SurveyId, SurveyPath, Upload,
+    UploadId, Wanted,
 };
 use heliomap_mapping::reconstruction::PhotoFacts;
+use heliomap_model::PlantId;
 use uuid::Uuid;
 
 pub async fn files_all_or_none(store: &dyn Store) {
@@ -23,6 +25,61 @@ pub async fn files_all_or_none(store: &dyn Store) {
     assert_eq!((found.path, found.photo, found.shots), (files[0].path.clone(), None, None));
     let refused = store.put_files(heliomap::store::SurveyId(Uuid::nil()), &[a]).await;
     assert!(matches!(refused, Err(StoreError::Gone { what: "survey" })));
+}
+
+pub async fn what_is_deleted_goes_and_models_say_so(store: &dyn Store) {
+    let survey = survey(store, plant(store, "A").await.id, "June").await;
+    let (a, b) = (file("images/a.jpg", "a"), file("images/b.jpg", "b"));
+    put(store, &survey, &[a.clone(), b.clone()]).await;
+    enqueue(store, &survey).await;
+    let mapped = claim(store, 0).await.unwrap();
+    store.complete_job(&mapped, &model(survey.plant, 1, 3), at(1)).await.unwrap();
+    let codes = async || {
+        let model = store.model(survey.plant, None).await.unwrap().unwrap();
+        model.warnings.into_iter().map(|warning| (warning.code, warning.images)).collect::<Vec<_>>()
+    };
+    let before = codes().await;
+
+    let other = Wanted::OneOf(vec![Digest::of(b"other")]);
+    let delete =
+        async |file: &FileRecord, wanted| store.delete_file(survey.id, &file.path, wanted, at(2)).await.unwrap();
+    assert_eq!(delete(&a, Some(&other)).await, FileDeleted::Other);
+    assert_eq!(delete(&a, None).await, FileDeleted::Deleted);
+    assert_eq!(delete(&a, None).await, FileDeleted::Absent);
+    assert_eq!(store.files(survey.id).await.unwrap().len(), 1);
+    let named = ("source_deleted".to_owned(), vec!["a.jpg".to_owned()]);
+    assert_eq!(codes().await, [before.clone(), vec![named.clone()]].concat());
+    // Nothing names its bytes any more, nor those of the survey's other file later on.
+    let unused = async || {
+        let taken = store.take_unused_blobs(at(100), LEASE, 9, at(100)).await.unwrap();
+        taken.into_iter().map(|unused| unused.blob.sha256).collect::<Vec<_>>()
+    };
+    assert_eq!(unused().await, [a.sha256]);
+
+    enqueue(store, &survey).await;
+    let running = claim(store, 10).await.unwrap();
+    assert_eq!(store.delete_survey(survey.id, at(11)).await.unwrap(), Some(Vec::new()));
+    assert_eq!(store.delete_survey(survey.id, at(11)).await.unwrap(), None);
+    assert!(matches!(store.heartbeat(&running, None, LEASE, at(12)).await.unwrap(), Heartbeat::Lost));
+    assert!(store.jobs(survey.plant, None, None, ALL).await.unwrap().is_empty());
+    assert_eq!(codes().await, [before, vec![named]].concat());
+    assert_eq!(unused().await, [b.sha256]);
+    let refused = store.delete_file(survey.id, &b.path, None, at(12)).await;
+    assert!(matches!(refused, Err(StoreError::Gone { what: "survey" })));
+}
+
+pub async fn names_are_changed_where_they_are_free(store: &dyn Store) {
+    let (first, second) = (plant(store, "A").await, plant(store, "B").await);
+    let (june, july) = (survey(store, first.id, "June").await, survey(store, first.id, "July").await);
+    assert_eq!(store.rename_plant(first.id, "C").await.unwrap().name, "C");
+    assert_eq!(store.rename_plant(first.id, "C").await.unwrap().name, "C");
+    assert!(matches!(store.rename_plant(first.id, "B").await, Err(StoreError::NameTaken)));
+    assert!(matches!(store.rename_plant(PlantId(Uuid::nil()), "D").await, Err(StoreError::Gone { .. })));
+    assert_eq!(store.rename_survey(june.id, "May").await.unwrap().name, "May");
+    assert!(matches!(store.rename_survey(july.id, "May").await, Err(StoreError::NameTaken)));
+    assert!(matches!(store.rename_survey(SurveyId(Uuid::nil()), "D").await, Err(StoreError::Gone { .. })));
+    // The same name is free elsewhere, and after all of this the store writes as before.
+    survey(store, second.id, "May").await;
 }
 
 pub async fn photos_and_what_was_found_in_them(store: &dyn Store) {

@@ -2,7 +2,7 @@
 
 use super::{ALL, LEASE, at, claim, enqueue, model, plant, state, survey};
 use heliomap::store::{
-    Cancelled, Checkpoint, Completed, Ending, Enqueued, Heartbeat, JobRequest, JobState, Page, Progress, Store,
+    Cancelled, Checkpoint, Completed, Ending, Enqueued, Heartbeat, JobId, JobRequest, JobState, Page, Progress, Store,
     StoreError,
 };
 use heliomap_model::PlantId;
@@ -12,8 +12,14 @@ use uuid::Uuid;
 pub async fn one_unfinished_job_per_survey(store: &dyn Store) {
     let survey = survey(store, plant(store, "A").await.id, "June").await;
     let job = enqueue(store, &survey).await;
-    let request =
-        JobRequest { plant: survey.plant, survey: survey.id, options: "[]".to_owned(), priority: 0, max_attempts: 2 };
+    let request = JobRequest {
+        id: JobId(Uuid::new_v4()),
+        plant: survey.plant,
+        survey: survey.id,
+        options: "[]".to_owned(),
+        priority: 0,
+        max_attempts: 2,
+    };
     let again = store.enqueue_job(&request, at(1)).await.unwrap();
     assert!(matches!(again, Enqueued::Existing(found) if found.id == job.id && found.options == "{}"));
     let claim = claim(store, 0).await.unwrap();
@@ -105,7 +111,14 @@ pub async fn retry_waits_and_ends(store: &dyn Store) {
 pub async fn the_pause_before_a_retry_grows_without_progress(store: &dyn Store) {
     let survey = survey(store, plant(store, "A").await.id, "June").await;
     let options = "{}".to_owned();
-    let request = JobRequest { plant: survey.plant, survey: survey.id, options, priority: 0, max_attempts: 9 };
+    let request = JobRequest {
+        id: JobId(Uuid::new_v4()),
+        plant: survey.plant,
+        survey: survey.id,
+        options,
+        priority: 0,
+        max_attempts: 9,
+    };
     store.enqueue_job(&request, at(0)).await.unwrap();
     let backoff = Duration::from_secs(5);
     let retry = Ending::Retry { code: "environment".to_owned(), message: "m".to_owned(), backoff };
@@ -221,7 +234,14 @@ pub async fn jobs_by_priority(store: &dyn Store) {
     for (name, priority) in [("A", 0), ("B", 5), ("C", 5), ("D", -5)] {
         let survey = survey(store, plant(store, name).await.id, "June").await;
         let options = "{}".to_owned();
-        let request = JobRequest { plant: survey.plant, survey: survey.id, options, priority, max_attempts: 2 };
+        let request = JobRequest {
+            id: JobId(Uuid::new_v4()),
+            plant: survey.plant,
+            survey: survey.id,
+            options,
+            priority,
+            max_attempts: 2,
+        };
         let Enqueued::New(job) = store.enqueue_job(&request, at(0)).await.unwrap() else { panic!("it is new") };
         assert_eq!(job.priority, priority);
         jobs.push(job.id);
@@ -253,8 +273,14 @@ pub async fn a_newer_schema_is_refused(store: &dyn Store, upgrade: impl AsyncFnO
     assert!(refused(store.try_to_write().await.err()));
     assert!(refused(store.heartbeat(&running, None, LEASE, at(1)).await.err()));
     assert!(refused(store.claim_job("worker", LEASE, at(100)).await.err()));
-    let request =
-        JobRequest { plant: plant.id, survey: second.id, options: "{}".to_owned(), priority: 0, max_attempts: 2 };
+    let request = JobRequest {
+        id: JobId(Uuid::new_v4()),
+        plant: plant.id,
+        survey: second.id,
+        options: "{}".to_owned(),
+        priority: 0,
+        max_attempts: 2,
+    };
     assert!(refused(store.enqueue_job(&request, at(1)).await.err()));
     assert!(refused(store.complete_job(&running, &model(plant.id, 1, 1), at(1)).await.err()));
     assert!(refused(store.create_survey(plant.id, "August", at(1)).await.err()));

@@ -121,7 +121,7 @@ pub async fn messages_are_claimed_once_and_have_limited_attempts(store: &dyn Sto
         }
     }
     assert!(take(100_000).await.is_none());
-    assert!(store.resend_delivery(webhook.id, taken.delivery.id, at(now)).await.unwrap().is_some());
+    assert!(store.resend_delivery(webhook.id, taken.delivery.id, None, at(now)).await.unwrap().is_some());
     for _ in 0..8 {
         now += 31;
         take(now).await.unwrap();
@@ -137,8 +137,8 @@ pub async fn messages_are_claimed_once_and_have_limited_attempts(store: &dyn Sto
     assert!(store.deliveries(webhook.id, Some(DeliveryState::Waiting), ALL).await.unwrap().is_empty());
 
     let refused = WebhookId(Uuid::nil());
-    assert!(store.resend_delivery(refused, dead[0].id, at(1000)).await.unwrap().is_none());
-    let waiting = store.resend_delivery(webhook.id, dead[0].id, at(1000)).await.unwrap().unwrap();
+    assert!(store.resend_delivery(refused, dead[0].id, None, at(1000)).await.unwrap().is_none());
+    let waiting = store.resend_delivery(webhook.id, dead[0].id, None, at(1000)).await.unwrap().unwrap();
     assert_eq!((waiting.state, waiting.finished), (DeliveryState::Waiting, None));
     let again = take(1000).await.unwrap();
     assert_eq!(again.delivery.attempts, 18);
@@ -146,6 +146,13 @@ pub async fn messages_are_claimed_once_and_have_limited_attempts(store: &dyn Sto
     assert!(!store.end_delivery(&again, &failed(1100), at(1002)).await.unwrap());
     let arrived = store.deliveries(webhook.id, Some(DeliveryState::Delivered), ALL).await.unwrap();
     assert_eq!((arrived[0].finished, &arrived[0].error), (Some(at(1001)), &None));
+    // Asked for twice under one identifier, it is sent again once.
+    let once = Some(Uuid::new_v4());
+    let resend = async |now| store.resend_delivery(webhook.id, dead[0].id, once, at(now)).await.unwrap().unwrap().state;
+    assert_eq!(resend(1000).await, DeliveryState::Waiting);
+    let again = take(1000).await.unwrap();
+    assert!(store.end_delivery(&again, &Sent::Arrived, at(1001)).await.unwrap());
+    assert_eq!(resend(1001).await, DeliveryState::Delivered);
     store.forget_old_deliveries(at(1001)).await.unwrap();
     assert_eq!(messages(store, &webhook).await.len(), 1);
     store.forget_old_deliveries(at(1002)).await.unwrap();

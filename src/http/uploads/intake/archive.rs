@@ -61,9 +61,9 @@ pub enum ArchiveError {
     SameName { entry: String },
     #[error(
         "none of its {entries} entries is a file of a reconstruction; expected are reconstruction.json, \
-         reference_lla.json, undistorted/… and images/… as OpenSfM leaves them"
+         reference_lla.json, undistorted/… and images/… as OpenSfM leaves them{hint}"
     )]
-    NothingKnown { entries: usize },
+    NothingKnown { entries: usize, hint: String },
     /// The service's own disk failed.
     #[error(transparent)]
     Disk(io::Error),
@@ -93,7 +93,8 @@ pub fn unpack(archive: &Path, folder: &Path, limits: &Limits) -> Result<Unpacked
     })?;
     let Places { taken, left_out } = places(&names)?;
     if taken.is_empty() {
-        return Err(ArchiveError::NothingKnown { entries: names.len() });
+        let hint = left_out.first().map(|left_out| format!(" ({}: {})", left_out.entry, left_out.reason));
+        return Err(ArchiveError::NothingKnown { entries: names.len(), hint: hint.unwrap_or_default() });
     }
     let mut unpacked = Unpacked { files: Vec::new(), ignored: Vec::new(), ignored_count: 0, left_out };
     let mut disk = Disk { folder, reserve: limits.disk_reserve, since: 0 };
@@ -102,7 +103,7 @@ pub fn unpack(archive: &Path, folder: &Path, limits: &Limits) -> Result<Unpacked
         match taken.get(&index) {
             Some(place) => unpacked.files.push((place.clone(), disk.stage(content)?)),
             None => {
-                // What is ignored is read as well: its checksum may tell that the archive came changed.
+                // What is ignored is read as well: its checksum shows whether the archive came changed.
                 io::copy(content, &mut io::sink()).map_err(read_error)?;
                 unpacked.ignored_count += 1;
                 if unpacked.ignored.len() < MAX_NAMED {
@@ -345,7 +346,7 @@ fn require_each_once(file: &Path, start: u64, count: usize) -> Result<(), Archiv
     file.seek(SeekFrom::Start(start)).map_err(ArchiveError::Disk)?;
     let mut names: BTreeSet<Vec<u8>> = BTreeSet::new();
     let mut record = vec![0; record_bytes];
-    // One more than the names that are known tells that one is there twice.
+    // One name more than are known means that one is there twice.
     while names.len() <= count && file.read_exact(&mut record).is_ok() && record.starts_with(signature) {
         let [name, extra, comment] = lengths_at.map(|at| usize::from(u16::from_le_bytes([record[at], record[at + 1]])));
         let mut text = vec![0; name];
