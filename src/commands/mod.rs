@@ -27,6 +27,8 @@ use heliomap::telemetry::metrics::{self, Metrics, Scrape};
 use heliomap::webhooks::{Sender, SenderSettings, Targets};
 use jiff::Timestamp;
 use object_store::aws::AmazonS3Builder;
+use std::fs::Permissions;
+use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
@@ -73,6 +75,7 @@ async fn open_storage(args: &StorageArgs) -> anyhow::Result<(Arc<dyn Store>, Blo
     let folder = &args.data_dir;
     let hint = || unusable(folder);
     let blobs = open_blobs(args).await?;
+    keep_to_owner(folder);
     blobs.sweep_staging(STALE_UPLOADS).await.with_context(hint)?;
     let store: Arc<dyn Store> = match &args.database {
         // The URL may hold a password: the error does not repeat it.
@@ -81,6 +84,18 @@ async fn open_storage(args: &StorageArgs) -> anyhow::Result<(Arc<dyn Store>, Blo
     };
     delete_expired(&*store, &blobs).await.with_context(hint)?;
     Ok((store, blobs))
+}
+
+/// Closes a data folder to other users of the machine; earlier versions left it as open as the system did.
+fn keep_to_owner(folder: &Path) {
+    const OWNER_ONLY: u32 = 0o700;
+    let is_open = |found: &std::fs::Metadata| found.permissions().mode() & 0o777 & !OWNER_ONLY != 0;
+    if !std::fs::metadata(folder).is_ok_and(|found| is_open(&found)) {
+        return;
+    }
+    if let Err(error) = std::fs::set_permissions(folder, Permissions::from_mode(OWNER_ONLY)) {
+        tracing::warn!(%error, folder = %folder.display(), "other users of this machine may read the data folder");
+    }
 }
 
 /// Deletes expired data.

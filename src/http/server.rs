@@ -24,6 +24,11 @@ const PAUSE: Duration = Duration::from_millis(100);
 /// How long a connection may be silent at its beginning.
 const FIRST_BYTE: Duration = Duration::from_secs(10);
 
+/// An address may hold so many connections however few are free, and beyond them so large a share of those that are: a few
+/// addresses do not take all.
+const FEW: usize = 4;
+const SHARE_OF_FREE: usize = 4;
+
 /// Where a request came from.
 #[derive(Debug, Clone, Copy)]
 pub struct Peer(pub SocketAddr);
@@ -32,7 +37,8 @@ pub struct Peer(pub SocketAddr);
 ///
 /// A connection is closed whose first byte does not come within 10 s, whose next request's head is not whole within
 /// `limits.request_timeout`, or whose client takes nothing of an answer for so long. Beyond `limits.max_connections` new
-/// ones wait; beyond `limits.max_connections_per_address` those of one address are closed.
+/// ones wait; beyond `limits.max_connections_per_address`, or a quarter of those that are free, those of one address are
+/// closed.
 pub async fn serve(listener: TcpListener, router: Router, limits: &Limits, stop: CancellationToken) {
     let graceful = GracefulShutdown::new();
     let room = Arc::new(Semaphore::new(limits.max_connections));
@@ -56,7 +62,11 @@ pub async fn serve(listener: TcpListener, router: Router, limits: &Limits, stop:
                 continue;
             }
         };
-        let Some(one) = crowd.admit(address.ip(), limits.max_connections_per_address) else {
+        let most = match limits.max_connections_per_address {
+            most if most < limits.max_connections => most.min(FEW.max(room.available_permits() / SHARE_OF_FREE)),
+            most => most,
+        };
+        let Some(one) = crowd.admit(address.ip(), most) else {
             tracing::debug!(%address, "there are too many connections from this address");
             continue;
         };
