@@ -79,7 +79,10 @@ class ClientTest(unittest.TestCase):
         survey = self.folder / "survey"
         (survey / "undistorted" / "depthmaps").mkdir(parents=True)
         cloud = survey / "undistorted" / "depthmaps" / "merged.ply"
-        cloud.write_bytes(b"ply\n" + os.urandom(uploading.RESUMED_BYTES + (8 << 20)))
+        properties = b"".join(b"property float %s\n" % name for name in (b"x", b"y", b"z"))
+        head = b"ply\nformat binary_little_endian 1.0\nelement vertex 1\n" + properties + b"end_header\n" + bytes(12)
+        # A cloud of one point; what follows is no part of it.
+        cloud.write_bytes(head + os.urandom(uploading.RESUMED_BYTES + (8 << 20)))
         plant = client.create_plant("Sunfield")["id"]
         here = client.create_survey(plant, "June")["id"]
 

@@ -26,6 +26,9 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent.parent
 PLACE = "undistorted/depthmaps/merged.ply"
+#: A point cloud of one point.
+PROPERTIES = b"".join(b"property float %s\n" % name for name in (b"x", b"y", b"z"))
+CLOUD = b"ply\nformat binary_little_endian 1.0\nelement vertex 1\n" + PROPERTIES + b"end_header\n" + bytes(12)
 
 
 class Proxy:
@@ -112,7 +115,8 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="heliomap-tus-") as folder:
         file = Path(folder) / "merged.ply"
         with open(file, "wb") as out:
-            out.write(b"ply\n")
+            # A cloud of one point; what follows is no part of it.
+            out.write(CLOUD)
             for _ in range(args.megabytes):
                 out.write(chance.randbytes(1 << 20))
         size = file.stat().st_size
