@@ -5,12 +5,12 @@ pub mod memory;
 use axum::Router;
 use axum::body::{Body, to_bytes};
 use axum::http::response::Parts;
-use axum::http::{Request, StatusCode};
+use axum::http::{HeaderValue, Request, StatusCode, header};
 use heliomap::config::Limits;
 use heliomap::http::{AppState, router};
 use heliomap_model::{Layer, ModuleId, PlantId};
 use heliomap::store::{
-    Blobs, Completed, Created, Digest, Enqueued, GeoBox, JobRequest, NewFeature, NewLayer, NewModel, OrganisationId,
+    Blobs, Completed, Created, Digest, Enqueued, GeoBox, JobId, JobRequest, NewFeature, NewLayer, NewModel, OrganisationId,
     Quotas, SqliteStore, Store,
 };
 use std::path::PathBuf;
@@ -80,7 +80,8 @@ impl Service {
     }
 
     /// Sends a request; the answer, which no input may make an internal error.
-    pub fn send(&self, request: Request<Body>) -> (Parts, Vec<u8>) {
+    pub fn send(&self, mut request: Request<Body>) -> (Parts, Vec<u8>) {
+        request.headers_mut().insert(header::HOST, HeaderValue::from_static("localhost"));
         let about = format!("{} {}", request.method(), request.uri());
         let answer = self.runtime.block_on(async {
             let response = self.app.clone().oneshot(request).await.expect("the router answers");
@@ -118,8 +119,14 @@ async fn fill(store: &dyn Store) -> (PlantId, heliomap::store::SurveyId) {
     let Ok(Created::New(survey)) = store.create_survey(plant.id, "Survey", now).await else {
         panic!("a survey can be made")
     };
-    let request =
-        JobRequest { plant: plant.id, survey: survey.id, options: "{}".to_owned(), priority: 0, max_attempts: 1 };
+    let request = JobRequest {
+        id: JobId(survey.id.0),
+        plant: plant.id,
+        survey: survey.id,
+        options: "{}".to_owned(),
+        priority: 0,
+        max_attempts: 1,
+    };
     let Ok(Enqueued::New(_)) = store.enqueue_job(&request, now).await else { panic!("a job can be queued") };
     let claim = store.claim_job("fuzz", Duration::from_secs(60), now).await;
     let claim = claim.expect("a job can be claimed").expect("there is one");

@@ -33,6 +33,8 @@ fuzz_target!(|bytes: &[u8]| {
     let path = SURVEY.join(FILES[usize::from(*which) % FILES.len()]);
     let before = std::fs::read(&path).ok();
     std::fs::write(&path, document).unwrap();
+    // What comes is looked at by itself first.
+    let _ = PROJECT.within(bytes.len(), "a look at a reconstruction", || opensfm::check::reconstruction(&path, 0));
     if let Ok(project) = PROJECT.within(bytes.len(), "a reconstruction", || opensfm::read(&*SURVEY, 1_000_000)) {
         assert_eq!(project.photos.len(), project.reconstruction.shots.len());
         for shot in &project.reconstruction.shots {
