@@ -120,7 +120,9 @@ pub fn map_folder(
         None => {
             let located = clock.stage(Stage::Locate, || fusion::locate::locate(&views, &cloud))?;
             let fusion_options = FusionOptions { rows_per_bench: options.rows_per_bench, ..FusionOptions::default() };
-            let fused = clock.stage(Stage::Fuse, || fusion::fuse(&views, located, &fusion_options))?;
+            let stopped = || observer.cancelled();
+            let fused = clock.stage(Stage::Fuse, || fusion::fuse_unless(&views, located, &fusion_options, stopped))?;
+            let fused = fused.ok_or(MapError::Cancelled)?;
             observer.save_structure(&fused, &of);
             fused
         }

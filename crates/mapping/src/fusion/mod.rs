@@ -185,8 +185,21 @@ pub struct Fused {
 
 /// Fuses located pieces into the structure of the plant. The result does not depend on the order of the views.
 pub fn fuse(views: &[View<'_>], located: Located, options: &FusionOptions) -> Fused {
+    fuse_unless(views, located, options, || false).unwrap_or_default()
+}
+
+/// As [`fuse`]; `None` soon after `stopped` is true, which is asked between the steps.
+pub fn fuse_unless(
+    views: &[View<'_>],
+    located: Located,
+    options: &FusionOptions,
+    stopped: impl Fn() -> bool,
+) -> Option<Fused> {
+    let go_on = || (!stopped()).then_some(());
     let mut doubts = Vec::new();
+    go_on()?;
     let (mut pieces, cameras) = by_geometry(views, located.pieces, options);
+    go_on()?;
     let mut clusters = associate::associate(&pieces, cameras.as_ref(), options);
     // A keypoint missed in one image lets one piece run over two benches; the other images tell where to split it.
     for _ in 0..3 {
@@ -195,15 +208,18 @@ pub fn fuse(views: &[View<'_>], located: Located, options: &FusionOptions) -> Fu
             break;
         }
         pieces = repair::split(pieces, &splits);
+        go_on()?;
         clusters = associate::associate(&pieces, cameras.as_ref(), options);
     }
     doubts.extend(clusters.doubts.iter().map(|doubt| doubt.describe(views, &pieces, &clusters)));
+    go_on()?;
     let benches = benches::assemble(views, &pieces, &clusters, &mut doubts);
+    go_on()?;
     let benches = benches::without_ghosts(views, benches, &mut doubts);
     let (lines, benches) = lines::arrange(benches, &mut doubts);
     let doubts = close(doubts, &benches);
     let camera_sigma_m = cameras.map_or_else(Vec::new, |cameras| cameras.sigma_m);
-    Fused { lines, benches, doubts, camera_sigma_m }
+    Some(Fused { lines, benches, doubts, camera_sigma_m })
 }
 
 /// Pieces where their boxes and the pitch of their type put them, and how well the cameras agree; where the cameras are too
@@ -226,5 +242,21 @@ fn by_geometry(
     match cameras.filter(|cameras| cameras.pitches < params.good_camera_pitches) {
         Some(cameras) => (moved, Some(cameras)),
         None => (pieces, None),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::cell::Cell;
+
+    #[test]
+    fn fusing_ends_at_the_next_step_where_it_is_stopped() {
+        let fused = |steps: usize| {
+            let left = Cell::new(steps);
+            let stopped = || left.replace(left.get().saturating_sub(1)) == 0;
+            fuse_unless(&[], Located { pieces: Vec::new() }, &FusionOptions::default(), stopped)
+        };
+        assert_eq!((0..5).map(|steps| fused(steps).is_some()).collect::<Vec<_>>(), [false, false, false, false, true]);
     }
 }

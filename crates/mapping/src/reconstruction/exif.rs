@@ -37,7 +37,7 @@ pub struct Position {
     pub height_m: Option<f64>,
 }
 
-/// Reads a photo's EXIF; a photo without any, or with what cannot be read, tells nothing. Cameras and programs that copy
+/// Reads a photo's EXIF; a photo without any, or with what cannot be read, has nothing to say. Cameras and programs that copy
 /// files write directories that are not to the letter: what can be read of them counts.
 pub fn read(path: &Path) -> Exposure {
     let fields = Fields::of_file(path).unwrap_or_default();

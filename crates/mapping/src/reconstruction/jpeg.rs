@@ -42,7 +42,7 @@ pub struct Structure {
     pub picture: Parts,
 }
 
-/// Application segments that tell how colours are to be read: JFIF and Adobe (ITU-T T.872, 6.5).
+/// Application segments that say how colours are to be read: JFIF and Adobe (ITU-T T.872, 6.5).
 const COLOUR_SEGMENTS: [u8; 2] = [0xe0, 0xee];
 
 fn is_metadata(marker: u8) -> bool {
