@@ -1,6 +1,7 @@
 """Structure from motion by COLMAP (pycolmap), as a process of its own.
 
-One request as JSON on standard input, one JSON object a line on standard output:
+One request as a line of JSON on standard input, one JSON object a line on standard output. Where standard input ends, the
+caller has gone, and this process ends, too.
 
     {"stage": "features", "done": 3, "total": 10}        progress: features, matches, mapping
     {"result": {...}}                                     the last line, exit status 0
@@ -9,10 +10,11 @@ One request as JSON on standard input, one JSON object a line on standard output
 A request:
 
     {"work": "folder for the database", "threads": 2, "seed": 1,
-     "cameras": [{"width": 5472, "height": 3648, "focal_px": 4000.0, "hold_focal": true}],
+     "cameras": [{"width": 5472, "height": 3648, "focal_px": 4000.0, "other_focal_px": null}],
      "images": [{"path": "/photos/a.jpg", "camera": 0, "enu_m": [east, north, up] or null}]}
 
-`enu_m` is the GNSS position in a local frame of the caller, metres. A result holds components, largest first, each in that
+Focal lengths are held. Where what the photos state can be read in two ways, `other_focal_px` is the second, and the one under
+which points fit better is taken. `enu_m` is the GNSS position in a local frame of the caller, metres. A result holds components, largest first, each in that
 frame where `aligned` says so, else in a frame and scale of its own:
 
     {"cameras": [{"focal_px": .., "k1": .., "k2": ..}],
@@ -28,6 +30,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -192,8 +195,9 @@ def map_incrementally(pycolmap, request: dict, database: Path, photos: Path, wor
     options.random_seed = request["seed"]
     options.min_model_size = 3
     options.extract_colors = False
-    options.ba_refine_focal_length = not all(camera["hold_focal"] for camera in request["cameras"])
-    options.mapper.abs_pose_refine_focal_length = options.ba_refine_focal_length
+    # Held: photos from one or two heights would trade it for a dome in the ground.
+    options.ba_refine_focal_length = False
+    options.mapper.abs_pose_refine_focal_length = False
     options.mapper.init_min_tri_angle = 6.0
     total = len(request["images"])
     placed = [0]
@@ -207,6 +211,51 @@ def map_incrementally(pycolmap, request: dict, database: Path, photos: Path, wor
     made = pycolmap.incremental_mapping(database, photos, sparse, options, next_image_callback=next_image)
     components = [component for component in made.values() if component.num_reg_images() >= 2]
     return sorted(components, key=lambda component: -component.num_reg_images())
+
+
+def squared_residuals(component) -> float:
+    """Sum over all observations of all points, square pixels."""
+    total = 0.0
+    for point in component.points3D.values():
+        for element in point.track.elements:
+            image = component.images[element.image_id]
+            projected = image.project_point(point.xyz)
+            if projected is not None:
+                total += float(np.sum((projected - image.points2D[element.point2D_idx].xy) ** 2))
+    return total
+
+
+def choose_focal_lengths(pycolmap, request: dict, components: list, index_of: dict[str, int], work: Path) -> list:
+    """Components adjusted with the other reading of a camera's focal length where that fits better."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length = False
+    options.print_summary = False
+    stored = work / "kept"
+    for index, camera in enumerate(request["cameras"]):
+        if camera["other_focal_px"] is None:
+            continue
+        changed = []
+        for component in components:
+            copy = stored / str(len(changed))
+            copy.mkdir(parents=True, exist_ok=True)
+            component.write(copy)
+            other = pycolmap.Reconstruction(copy)
+            of_camera = {
+                image.camera_id
+                for image in other.images.values()
+                if request["images"][index_of[image.name]]["camera"] == index
+            }
+            for camera_id in of_camera:
+                params = np.array(other.cameras[camera_id].params)
+                params[0] = camera["other_focal_px"]
+                other.cameras[camera_id].params = params
+            if of_camera:
+                pycolmap.bundle_adjustment(other, options)
+            changed.append(other)
+        # The largest component knows best.
+        if squared_residuals(changed[0]) < squared_residuals(components[0]):
+            components = changed
+    return components
 
 
 def describe(component, request: dict, index_of: dict[str, int]) -> dict:
@@ -264,6 +313,7 @@ def reconstruct(request: dict) -> dict:
     if not components:
         raise Refused("nothing_reconstructed", "no two photos fit together: fly with more overlap, in one light")
     index_of = {name: index for index, name in enumerate(names)}
+    components = choose_focal_lengths(pycolmap, request, components, index_of, work)
     cameras: list[dict | None] = [None] * len(request["cameras"])
     for image in components[0].images.values():
         index = request["images"][index_of[image.name]]["camera"]
@@ -272,9 +322,15 @@ def reconstruct(request: dict) -> dict:
     return {"cameras": cameras, "components": [describe(component, request, index_of) for component in components]}
 
 
+def end_with_caller() -> None:
+    sys.stdin.read()
+    os._exit(1)
+
+
 def main() -> int:
     try:
-        request = json.load(sys.stdin)
+        request = json.loads(sys.stdin.readline())
+        threading.Thread(target=end_with_caller, daemon=True).start()
         emit({"result": reconstruct(request)})
         return 0
     except Refused as refused:

@@ -15,6 +15,8 @@ use std::time::Duration;
 const SCRIPT: &str = include_str!("../engine/engine.py");
 /// How often cancelling is looked for.
 const LOOK_EVERY: Duration = Duration::from_millis(200);
+/// So often is looked whether a process that has closed its output has ended.
+const ENDING_LOOKS: usize = 10;
 /// Longest line that the engine may write: a result of ten million points.
 const MAX_LINE_BYTES: u64 = 1 << 30;
 /// So many lines of what the engine writes to standard error are shown where it fails.
@@ -56,7 +58,7 @@ struct RequestCamera {
     width: u32,
     height: u32,
     focal_px: f64,
-    hold_focal: bool,
+    other_focal_px: Option<f64>,
 }
 
 #[derive(Serialize)]
@@ -67,11 +69,10 @@ struct RequestImage {
 }
 
 impl Request {
-    /// The focal length is held: overview photos from one height leave it to the doming of the plant.
     pub(crate) fn of(survey: &Survey, work: &Path, options: &Options) -> Self {
         let cameras = survey.cameras.iter().map(|camera| {
             let [width, height] = camera.size_px;
-            RequestCamera { width, height, focal_px: camera.focal_px, hold_focal: true }
+            RequestCamera { width, height, focal_px: camera.focal_px, other_focal_px: camera.other_focal_px }
         });
         let images = survey.photos.iter().map(|photo| {
             let enu_m = photo.gnss_enu_m.map(Into::into);
@@ -148,11 +149,14 @@ pub(crate) fn run(python: &Path, request: &Request, observer: &dyn Observer) -> 
     else {
         return Err(process.crashed("it has no standard streams".to_owned()));
     };
-    let text = serde_json::to_vec(request).unwrap_or_default();
+    let mut text = serde_json::to_vec(request).unwrap_or_default();
+    text.push(b'\n');
+    // Kept open until the end: the engine ends where its input does, also when this process is killed.
     let writer = thread::spawn(move || {
         let mut stdin = stdin;
         // An engine that ends before it has read everything says why in what it writes.
         let _ = stdin.write_all(&text);
+        stdin
     });
     let last_words = thread::spawn(move || last_lines(BufReader::new(stderr)));
     let (sender, lines) = channel();
@@ -167,9 +171,11 @@ pub(crate) fn run(python: &Path, request: &Request, observer: &dyn Observer) -> 
         }
     });
     let outcome = follow(&lines, observer);
-    if outcome.is_err() {
-        process.kill();
+    if matches!(outcome, Ok(None)) {
+        process.let_end();
     }
+    // A result is whole; what the process does after it is of no interest.
+    process.kill();
     let _ = (writer.join(), reader.join());
     let words = last_words.join().unwrap_or_default();
     match outcome {
@@ -217,6 +223,16 @@ impl Process {
     fn kill(&mut self) {
         // It may have ended by itself.
         let _ = self.0.kill();
+    }
+
+    /// Gives a process that has closed its output the time to say with which status it ends.
+    fn let_end(&mut self) {
+        for _ in 0..ENDING_LOOKS {
+            if !matches!(self.0.try_wait(), Ok(None)) {
+                return;
+            }
+            thread::sleep(LOOK_EVERY);
+        }
     }
 
     /// The error for a process that gave no result.

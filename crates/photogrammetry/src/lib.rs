@@ -5,6 +5,7 @@ mod engine;
 mod error;
 mod export;
 mod photos;
+mod sensors;
 
 pub use engine::Stage;
 pub use error::ReconstructError;

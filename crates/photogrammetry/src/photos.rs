@@ -1,6 +1,6 @@
 //! The photos of a survey, their cameras and where they were taken, by what stands in their files.
 
-use crate::{Options, ReconstructError};
+use crate::{Options, ReconstructError, sensors};
 use heliomap_mapping::reconstruction::{ProjectFolder, exif, photo, xmp};
 use heliomap_model::{GeodeticReference, Lla};
 use nalgebra::Vector3;
@@ -15,6 +15,12 @@ const MIN_SPREAD_M: f64 = 2.0;
 /// A calibrated focal length this far from that of the 35-mm equivalent is of another size of the photo.
 const MAX_FOCAL_RATIO: f64 = 1.15;
 
+/// 36 mm x 24 mm film.
+const FILM_WIDTH_MM: f64 = 36.0;
+const FILM_DIAGONAL_MM: f64 = 43.27;
+/// Focal lengths that differ by less than this share are the same: half a millimetre of rounding is more.
+const SAME_FOCAL: f64 = 0.005;
+
 /// Where a focal length comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
@@ -23,6 +29,8 @@ pub enum FocalSource {
     Given,
     /// The manufacturer's calibration in the photo's XMP.
     Calibrated,
+    /// The focal length in millimetres in EXIF and the sensor of a known camera.
+    Sensor,
     /// The 35-mm equivalent in EXIF, in whole millimetres: off by up to 2 % for wide lenses.
     FilmEquivalent,
 }
@@ -34,6 +42,8 @@ pub(crate) struct SurveyCamera {
     pub(crate) name: String,
     pub(crate) size_px: [u32; 2],
     pub(crate) focal_px: f64,
+    /// Another reading of what the photos state; the reconstruction decides.
+    pub(crate) other_focal_px: Option<f64>,
     pub(crate) source: FocalSource,
 }
 
@@ -139,11 +149,16 @@ fn describe(path: PathBuf, name: &str, options: &Options) -> Result<Option<Descr
     let header = photo::inspect(&path, name, options.max_image_pixels)?;
     let exposure = exif::read(&path);
     let size_px = [header.width_px, header.height_px];
-    let (focal_px, source) = focal_of(&path, size_px, options.focal_share)
+    let model = exposure.camera.unwrap_or_else(|| "unknown camera".to_owned());
+    let (focal_px, source) = focal_of(&path, &model, size_px, options.focal_share)
         .ok_or_else(|| ReconstructError::NoFocalLength { photo: name.to_owned() })?;
     let [width, height] = size_px;
-    let model = exposure.camera.unwrap_or_else(|| "unknown camera".to_owned());
-    let camera = SurveyCamera { name: format!("{model} {width} x {height} {focal_px:.1}"), size_px, focal_px, source };
+    let other_focal_px = match source {
+        FocalSource::FilmEquivalent => other_film_px(focal_px, size_px),
+        _ => None,
+    };
+    let name = format!("{model} {width} x {height} {focal_px:.1}");
+    let camera = SurveyCamera { name, size_px, focal_px, other_focal_px, source };
     let position = exposure.position.and_then(|position| {
         let height_m = position.height_m?;
         Some(Lla { latitude_deg: position.latitude_deg, longitude_deg: position.longitude_deg, height_m })
@@ -151,17 +166,50 @@ fn describe(path: PathBuf, name: &str, options: &Options) -> Result<Option<Descr
     Ok(Some(Described { path, camera, position }))
 }
 
+/// The 35-mm equivalent compares diagonals (CIPA DCG-001); some programs compare the longer sides, 36 mm on film. For photos of
+/// film's own shape both are the same, `None`.
+fn other_film_px(by_diagonal_px: f64, [width, height]: [u32; 2]) -> Option<f64> {
+    let (longer_px, diagonal_px) = (f64::from(width.max(height)), f64::from(width).hypot(f64::from(height)));
+    let by_side_px = by_diagonal_px * (FILM_DIAGONAL_MM / FILM_WIDTH_MM) * longer_px / diagonal_px;
+    ((by_side_px / by_diagonal_px - 1.0).abs() > SAME_FOCAL).then_some(by_side_px)
+}
+
 /// The focal length of a photo, pixels, and where it comes from.
-fn focal_of(path: &Path, [width, height]: [u32; 2], given_share: Option<f64>) -> Option<(f64, FocalSource)> {
+fn focal_of(
+    path: &Path,
+    camera: &str,
+    [width, height]: [u32; 2],
+    given_share: Option<f64>,
+) -> Option<(f64, FocalSource)> {
+    let longer_px = f64::from(width.max(height));
     if let Some(share) = given_share {
-        return Some((share * f64::from(width.max(height)), FocalSource::Given));
+        return Some((share * longer_px, FocalSource::Given));
     }
-    let film_px = exif::film_focal_px(path, width, height)?;
-    // Drones write it in pixels of the whole sensor: of a photo that was scaled or cropped it says nothing.
-    let calibrated_px = xmp::number(path, "drone-dji:CalibratedFocalLength")
-        .filter(|px| (1.0 / MAX_FOCAL_RATIO..MAX_FOCAL_RATIO).contains(&(px / film_px)));
-    Some(match calibrated_px {
-        Some(focal_px) => (focal_px, FocalSource::Calibrated),
-        None => (film_px, FocalSource::FilmEquivalent),
-    })
+    let film_px = exif::film_focal_px(path, width, height);
+    // Both are of the whole sensor at full size: of a photo that was scaled or cropped they say nothing.
+    let agrees =
+        |px: &f64| film_px.is_none_or(|film_px| (1.0 / MAX_FOCAL_RATIO..MAX_FOCAL_RATIO).contains(&(px / film_px)));
+    let calibrated_px =
+        xmp::number(path, "drone-dji:CalibratedFocalLength").filter(|px| film_px.is_some() && agrees(px));
+    if let Some(px) = calibrated_px {
+        return Some((px, FocalSource::Calibrated));
+    }
+    let sensor_px =
+        sensors::longer_side_mm(camera).and_then(|side_mm| Some(exif::focal_mm(path)? / side_mm * longer_px));
+    match sensor_px.filter(agrees) {
+        Some(px) => Some((px, FocalSource::Sensor)),
+        None => film_px.map(|px| (px, FocalSource::FilmEquivalent)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn readings_of_the_35_mm_equivalent_differ_by_the_shape_of_the_photo() {
+        assert_eq!(other_film_px(1000.0, [1368, 912]), None);
+        let other = other_film_px(1000.0, [2433, 1824]).unwrap();
+        assert!((other / 1000.0 - 0.9615).abs() < 1e-3, "{other}");
+    }
 }

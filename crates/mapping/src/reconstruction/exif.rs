@@ -52,6 +52,11 @@ pub fn film_focal_px(path: &Path, width: u32, height: u32) -> Option<f64> {
     (focal_px > 1.0).then_some(focal_px)
 }
 
+/// The focal length of the lens, millimetres.
+pub fn focal_mm(path: &Path) -> Option<f64> {
+    Fields::of_file(path)?.focal_mm.filter(|focal_mm| *focal_mm > 0.0)
+}
+
 /// The most values that an entry of a TIFF's first directory claims, of those that a decoder reads: the baseline tags, less
 /// texts (TIFF 6.0, part 1 and section 21). `None` where it has no directory that can be read.
 pub fn most_tiff_values<R: Read + Seek>(file: &mut R) -> Option<u32> {
@@ -76,6 +81,7 @@ struct Fields {
     modified: Option<String>,
     taken: Option<String>,
     utc_offset: Option<String>,
+    focal_mm: Option<f64>,
     film_focal_mm: Option<u32>,
     latitude: Angle,
     longitude: Angle,
@@ -108,6 +114,7 @@ mod tag {
     pub const GPS_DIRECTORY: u16 = 0x8825;
     pub const DATE_TIME_ORIGINAL: u16 = 0x9003;
     pub const OFFSET_TIME_ORIGINAL: u16 = 0x9011;
+    pub const FOCAL_LENGTH: u16 = 0x920a;
     pub const FILM_FOCAL_LENGTH: u16 = 0xa405;
     pub const LATITUDE_HALF: u16 = 1;
     pub const LATITUDE: u16 = 2;
@@ -137,6 +144,7 @@ impl Fields {
             tiff.each(exif, MAX_ENTRIES, |tiff, entry| match entry.tag {
                 tag::DATE_TIME_ORIGINAL => fields.taken = tiff.text(entry),
                 tag::OFFSET_TIME_ORIGINAL => fields.utc_offset = tiff.text(entry),
+                tag::FOCAL_LENGTH => fields.focal_mm = tiff.rationals(entry).map(|[focal_mm, ..]| focal_mm),
                 tag::FILM_FOCAL_LENGTH => fields.film_focal_mm = tiff.number(entry),
                 _ => {}
             });
