@@ -3,103 +3,26 @@
 //!
 //! Every Huffman code of every scan is read without making a picture of it (ITU-T T.81, annexes F and G). Damage shows as
 //! a code that does not exist, a block of more than 64 coefficients, a mean that no picture has, restart markers out of
-//! order, or as data that ends before or after the last block. What is refined in later scans of a progressive JPEG needs
-//! the picture to be read, and is passed over; so are arithmetic coding and lossless processes, which no camera uses.
+//! order, or as data that ends before or after the last block. Arithmetic coding and lossless processes, which no camera
+//! uses, are passed over.
 
-use std::io::{BufRead, ErrorKind, Read};
+mod bits;
+mod huffman;
 
-/// Most bytes between the last block of a scan and the next marker: some encoders fill up.
-const MAX_FILL_BYTES: u32 = 16;
+pub use bits::Damage;
+use bits::{Bits, Stop};
+use huffman::Table;
+use std::collections::BTreeMap;
+use std::io::BufRead;
+
 /// Largest mean of a block times 8, grey levels: twice that of a picture of 8 bits, for encoders that round up.
 const MAX_DC: i64 = 2048;
-
-/// Why data is damaged.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Damage {
-    /// A code that the tables do not have.
-    NoSuchCode,
-    /// More coefficients than a block has.
-    TooManyCoefficients,
-    /// A block brighter or darker than any.
-    Mean,
-    /// A restart marker is missing or out of order.
-    Restart,
-    /// Data ends before the last block.
-    EndsEarly,
-    /// Data goes on after the last block.
-    GoesOn,
-}
-
-/// What reading on gives up with.
-enum Stop {
-    Damaged(Damage),
-    /// The file is no JPEG that this reads, which others judge.
-    NotRead,
-}
-
-impl From<std::io::Error> for Stop {
-    fn from(error: std::io::Error) -> Self {
-        if error.kind() == ErrorKind::UnexpectedEof { Self::Damaged(Damage::EndsEarly) } else { Self::NotRead }
-    }
-}
 
 /// What is damaged in the data of a JPEG whose structure is whole; `None` where all of it reads as it should.
 pub fn damage(jpeg: impl BufRead) -> Option<Damage> {
     match Reader::new(jpeg).read() {
         Err(Stop::Damaged(damage)) => Some(damage),
         Ok(()) | Err(Stop::NotRead) => None,
-    }
-}
-
-/// A Huffman table: the symbol and length of each code, by its first bits.
-#[derive(Clone)]
-struct Table {
-    /// By the next [`Table::FAST`] bits: symbol and length; length 0 for longer codes.
-    fast: Vec<(u8, u8)>,
-    /// For each length, one more than the last code of it, moved to 16 bits; 0 where it has none.
-    ends: [u32; 17],
-    /// For each length, the index of its first symbol less its first code.
-    offsets: [i64; 17],
-    symbols: Vec<u8>,
-}
-
-impl Table {
-    const FAST: u32 = 9;
-
-    /// From the number of codes of each length, and their symbols in order (T.81, C.2).
-    fn new(counts: &[u8; 16], symbols: Vec<u8>) -> Option<Self> {
-        let mut table = Self { fast: vec![(0, 0); 1 << Self::FAST], ends: [0; 17], offsets: [0; 17], symbols };
-        let (mut code, mut index) = (0_u32, 0_usize);
-        for length in 1..=16_u32 {
-            let count = u32::from(counts[length as usize - 1]);
-            if code + count > 1 << length {
-                return None;
-            }
-            table.offsets[length as usize] = index as i64 - i64::from(code);
-            for _ in 0..count {
-                if length <= Self::FAST {
-                    let from = (code << (Self::FAST - length)) as usize;
-                    let entry = (*table.symbols.get(index)?, length as u8);
-                    table.fast[from..from + (1 << (Self::FAST - length))].fill(entry);
-                }
-                code += 1;
-                index += 1;
-            }
-            table.ends[length as usize] = if count > 0 { code << (16 - length) } else { 0 };
-            code <<= 1;
-        }
-        Some(table)
-    }
-
-    /// The symbol and length of the code that begins 16 bits.
-    fn look_up(&self, bits: u32) -> Option<(u8, u32)> {
-        let (symbol, length) = self.fast[(bits >> (16 - Self::FAST)) as usize];
-        if length > 0 {
-            return Some((symbol, u32::from(length)));
-        }
-        let length = (1..=16).find(|length| bits < self.ends[*length])?;
-        let index = i64::from(bits >> (16 - length)) + self.offsets[length];
-        Some((*self.symbols.get(usize::try_from(index).ok()?)?, length as u32))
     }
 }
 
@@ -161,6 +84,8 @@ struct Reader<R> {
     frame: Option<Frame>,
     /// Tables of means and of other coefficients.
     tables: [[Option<Table>; 4]; 2],
+    /// Of each component of a progressive picture and each of its blocks: which coefficients are not zero so far, a bit each.
+    known: BTreeMap<u8, Vec<u64>>,
     /// The first value of each quantisation table.
     steps: [i64; 4],
     /// Units between two restart markers; 0 for none.
@@ -169,8 +94,8 @@ struct Reader<R> {
 
 impl<R: BufRead> Reader<R> {
     fn new(file: R) -> Self {
-        let bits = Bits { file, held: 0, count: 0, marker: None };
-        Self { bits, frame: None, tables: Default::default(), steps: [1; 4], restart_interval: 0 }
+        let (tables, known) = (Default::default(), BTreeMap::new());
+        Self { bits: Bits::new(file), frame: None, tables, known, steps: [1; 4], restart_interval: 0 }
     }
 
     fn read(&mut self) -> Result<(), Stop> {
@@ -228,15 +153,21 @@ impl<R: BufRead> Reader<R> {
         let frame = self.frame.as_ref().ok_or(Stop::NotRead)?;
         let (components, band) = scan_header(&header, frame)?;
         let units = frame.units(&components);
-        let scan = Scan { components, band, progressive: frame.progressive, tables: &self.tables, steps: self.steps };
-        if band.refines && band.from > 0 {
-            return Ok(());
+        let mut known = match components.as_slice() {
+            [only] if frame.progressive && band.from > 0 => self.known.remove(&only.component.id).unwrap_or_default(),
+            _ => Vec::new(),
+        };
+        if frame.progressive && band.from > 0 {
+            known.resize(usize::try_from(units).map_err(|_| Stop::NotRead)?, 0);
         }
+        let first = components.first().map(|selected| selected.component.id);
+        let scan = Scan { components, band, progressive: frame.progressive, tables: &self.tables, steps: self.steps };
         self.bits.start();
         let (mut done, mut restarts) = (0, 0);
         while done < units {
             let now = if self.restart_interval == 0 { units } else { self.restart_interval.min(units - done) };
-            scan.read(&mut self.bits, now)?;
+            let blocks = known.get_mut(done as usize..(done + now) as usize).unwrap_or_default();
+            scan.read(&mut self.bits, now, blocks)?;
             done += now;
             self.bits.end(done == units)?;
             if done < units {
@@ -246,6 +177,9 @@ impl<R: BufRead> Reader<R> {
                 }
                 self.bits.start();
             }
+        }
+        if let Some(id) = first.filter(|_| !known.is_empty()) {
+            self.known.insert(id, known);
         }
         Ok(())
     }
@@ -303,51 +237,65 @@ impl Scan<'_> {
         self.tables[kind].get(index).and_then(Option::as_ref).ok_or(Stop::NotRead)
     }
 
-    /// Reads so many units, the last of which ends at a marker.
-    fn read<R: BufRead>(&self, bits: &mut Bits<R>, units: u64) -> Result<(), Stop> {
+    /// Reads so many units, the last of which ends at a marker. `known` is of each block of a band without means.
+    fn read<R: BufRead>(&self, bits: &mut Bits<R>, units: u64, known: &mut [u64]) -> Result<(), Stop> {
         let mut means = vec![0_i64; self.components.len()];
         // Blocks that hold nothing more in this band (T.81, G.1.2.2).
         let mut empty = 0_u32;
-        for _ in 0..units {
+        for unit in 0..units {
+            if self.band.from > 0 && self.progressive {
+                let (Some(selected), Some(known)) = (self.components.first(), known.get_mut(unit as usize)) else {
+                    return Err(Stop::NotRead);
+                };
+                match self.band.refines {
+                    true => self.refined(bits, selected, known, &mut empty)?,
+                    false => self.coefficients(bits, selected, known, &mut empty)?,
+                }
+                continue;
+            }
             for (selected, mean) in self.components.iter().zip(&mut means) {
                 let blocks = match self.components.len() {
                     1 => 1,
                     _ => selected.component.sampling[0] * selected.component.sampling[1],
                 };
                 for _ in 0..blocks {
-                    self.block(bits, selected, mean, &mut empty)?;
+                    self.block(bits, selected, mean)?;
                 }
             }
         }
         if empty > 0 { Err(Stop::Damaged(Damage::TooManyCoefficients)) } else { Ok(()) }
     }
 
-    fn block<R: BufRead>(
+    /// A block with its mean and, in a sequential picture, all else.
+    fn block<R: BufRead>(&self, bits: &mut Bits<R>, selected: &Selected, mean: &mut i64) -> Result<(), Stop> {
+        if self.band.refines {
+            bits.take(1)?;
+            return Ok(());
+        }
+        let category = u32::from(bits.symbol(self.table(0, selected.dc)?)?);
+        if category > 11 {
+            return Err(Stop::Damaged(Damage::Mean));
+        }
+        let value = i64::from(bits.take(category)?);
+        *mean += if category > 0 && value >> (category - 1) == 0 { value + 1 - (1 << category) } else { value };
+        let step = self.steps[selected.component.quantisation];
+        if ((*mean << self.band.shift) * step).abs() > MAX_DC + step {
+            return Err(Stop::Damaged(Damage::Mean));
+        }
+        match self.progressive {
+            true => Ok(()),
+            false => self.coefficients(bits, selected, &mut 0, &mut 0),
+        }
+    }
+
+    /// The coefficients of a block besides its mean, as they first come.
+    fn coefficients<R: BufRead>(
         &self,
         bits: &mut Bits<R>,
         selected: &Selected,
-        mean: &mut i64,
+        known: &mut u64,
         empty: &mut u32,
     ) -> Result<(), Stop> {
-        if self.band.from == 0 {
-            if self.band.refines {
-                bits.take(1)?;
-                return Ok(());
-            }
-            let category = u32::from(bits.symbol(self.table(0, selected.dc)?)?);
-            if category > 11 {
-                return Err(Stop::Damaged(Damage::Mean));
-            }
-            let value = i64::from(bits.take(category)?);
-            *mean += if category > 0 && value >> (category - 1) == 0 { value + 1 - (1 << category) } else { value };
-            let dc = (*mean << self.band.shift) * self.steps[selected.component.quantisation];
-            if dc.abs() > MAX_DC + self.steps[selected.component.quantisation] {
-                return Err(Stop::Damaged(Damage::Mean));
-            }
-            if self.progressive {
-                return Ok(());
-            }
-        }
         if *empty > 0 {
             *empty -= 1;
             return Ok(());
@@ -371,140 +319,64 @@ impl Scan<'_> {
                         return Err(Stop::Damaged(Damage::TooManyCoefficients));
                     }
                     bits.take(size)?;
+                    *known |= 1 << at;
                     at += 1;
                 }
             }
         }
         if at > end + 1 { Err(Stop::Damaged(Damage::TooManyCoefficients)) } else { Ok(()) }
     }
-}
 
-/// The bits of a file, within a scan those of its data up to the next marker.
-struct Bits<R> {
-    file: R,
-    held: u64,
-    count: u32,
-    /// The marker that ended the data.
-    marker: Option<u8>,
-}
-
-impl<R: BufRead> Bits<R> {
-    fn array<const N: usize>(&mut self) -> Result<[u8; N], Stop> {
-        let mut bytes = [0; N];
-        self.file.read_exact(&mut bytes)?;
-        Ok(bytes)
-    }
-
-    /// The content of a segment.
-    fn segment(&mut self) -> Result<Vec<u8>, Stop> {
-        let length = u64::from(u16::from_be_bytes(self.array()?)).checked_sub(2).ok_or(Stop::NotRead)?;
-        let mut content = Vec::new();
-        Read::take(&mut self.file, length).read_to_end(&mut content)?;
-        Ok(content)
-    }
-
-    /// The marker that ended a scan, or the next; what stands before it is passed over.
-    fn next_marker(&mut self) -> Result<u8, Stop> {
-        if let Some(marker) = self.marker.take() {
-            return Ok(marker);
-        }
-        loop {
-            let [mut byte] = self.array()?;
-            while byte != 0xff {
-                [byte] = self.array()?;
+    /// A further bit of the coefficients of a block, and those that are no longer zero with it (T.81, G.1.2.3).
+    fn refined<R: BufRead>(
+        &self,
+        bits: &mut Bits<R>,
+        selected: &Selected,
+        known: &mut u64,
+        empty: &mut u32,
+    ) -> Result<(), Stop> {
+        let table = self.table(1, selected.ac)?;
+        let (mut at, end) = (u32::from(self.band.from), u32::from(self.band.to));
+        while *empty == 0 && at <= end {
+            let symbol = bits.symbol(table)?;
+            let (mut zeros, size) = (u32::from(symbol >> 4), u32::from(symbol & 15));
+            match (zeros, size) {
+                (_, 1) => drop(bits.take(1)?),
+                (15, 0) => {}
+                // This block, and so many after it, have no new ones.
+                (run, 0) => {
+                    *empty = (1 << run) + bits.take(run)?;
+                    break;
+                }
+                _ => return Err(Stop::Damaged(Damage::NoSuchCode)),
             }
-            while byte == 0xff {
-                [byte] = self.array()?;
+            while at <= end {
+                if *known >> at & 1 == 1 {
+                    bits.take(1)?;
+                } else if zeros == 0 {
+                    break;
+                } else {
+                    zeros -= 1;
+                }
+                at += 1;
             }
-            if byte != 0 {
-                return Ok(byte);
+            if size == 1 {
+                if at > end {
+                    return Err(Stop::Damaged(Damage::TooManyCoefficients));
+                }
+                *known |= 1 << at;
             }
+            at += 1;
         }
-    }
-
-    fn start(&mut self) {
-        (self.held, self.count, self.marker) = (0, 0, None);
-    }
-
-    /// The next byte of the data; `None` from its end on.
-    fn byte(&mut self) -> Result<Option<u8>, Stop> {
-        if self.marker.is_some() {
-            return Ok(None);
-        }
-        let [byte] = self.array()?;
-        if byte != 0xff {
-            return Ok(Some(byte));
-        }
-        let [mut next] = self.array()?;
-        while next == 0xff {
-            [next] = self.array()?;
-        }
-        if next == 0 {
-            return Ok(Some(0xff));
-        }
-        self.marker = Some(next);
-        Ok(None)
-    }
-
-    /// Holds 16 bits at least where there are so many.
-    fn fill(&mut self) -> Result<(), Stop> {
-        while self.count <= 48 {
-            let Some(byte) = self.byte()? else { break };
-            self.held = self.held << 8 | u64::from(byte);
-            self.count += 8;
+        if *empty > 0 {
+            for at in at..=end {
+                if *known >> at & 1 == 1 {
+                    bits.take(1)?;
+                }
+            }
+            *empty -= 1;
         }
         Ok(())
-    }
-
-    fn take(&mut self, count: u32) -> Result<u32, Stop> {
-        if count == 0 {
-            return Ok(0);
-        }
-        if self.count < count {
-            self.fill()?;
-        }
-        self.count = self.count.checked_sub(count).ok_or(Stop::Damaged(Damage::EndsEarly))?;
-        Ok((self.held >> self.count) as u32 & ((1 << count) - 1))
-    }
-
-    fn symbol(&mut self, table: &Table) -> Result<u8, Stop> {
-        if self.count < 16 {
-            self.fill()?;
-        }
-        // Past the end there are ones, as fill bits are.
-        let bits = match self.count {
-            16.. => (self.held >> (self.count - 16)) as u32 & 0xffff,
-            few => {
-                let missing = 16 - few;
-                ((self.held << missing) as u32 | ((1 << missing) - 1)) & 0xffff
-            }
-        };
-        match table.look_up(bits) {
-            Some((_, length)) if length > self.count => Err(Stop::Damaged(Damage::EndsEarly)),
-            Some((symbol, length)) => {
-                self.count -= length;
-                Ok(symbol)
-            }
-            None if self.count < 16 && self.marker.is_some() => Err(Stop::Damaged(Damage::EndsEarly)),
-            None => Err(Stop::Damaged(Damage::NoSuchCode)),
-        }
-    }
-
-    /// Reads on to the marker that ends the data. After the last unit it may be filled up.
-    fn end(&mut self, is_last: bool) -> Result<(), Stop> {
-        let mut extra = self.count / 8;
-        while self.byte()?.is_some() {
-            extra += 1;
-            if extra > MAX_FILL_BYTES {
-                break;
-            }
-        }
-        // A restart marker where the last unit was: none was due.
-        let restarts = is_last && self.marker.is_some_and(|marker| (0xd0..=0xd7).contains(&marker));
-        match extra {
-            0..=MAX_FILL_BYTES if !restarts => Ok(()),
-            _ => Err(Stop::Damaged(Damage::GoesOn)),
-        }
     }
 }
 
@@ -553,6 +425,19 @@ mod tests {
         };
         let count = places.iter().filter(found).count();
         assert!(count * 10 >= places.len() * 9, "{count} of {}", places.len());
+    }
+
+    #[test]
+    fn progressive_pictures_are_read_through_all_their_scans() {
+        let whole = include_bytes!("../../tests/fixtures/progressive.jpg");
+        assert_eq!(damage(whole.as_slice()), None);
+        let places: Vec<usize> = (data(whole)..whole.len() - 160).step_by(37).collect();
+        let found = |at: &&usize| {
+            let spoilt = [&whole[..**at], &[0; 150], &whole[**at + 150..]].concat();
+            damage(spoilt.as_slice()).is_some()
+        };
+        let count = places.iter().filter(found).count();
+        assert!(count * 10 >= places.len() * 8, "{count} of {}", places.len());
     }
 
     #[test]
