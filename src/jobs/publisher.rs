@@ -59,7 +59,10 @@ impl TaskPublisher {
         match self.runtime.block_on(offer) {
             Ok(true) => {
                 let places = images.iter().enumerate().map(|(place, image)| (image.image.clone(), place));
-                self.state().places = places.collect();
+                let mut state = self.state();
+                state.places = places.collect();
+                // Positions of images that were offered before are none of these.
+                state.found.clear();
                 true
             }
             Ok(false) => false,

@@ -356,6 +356,7 @@ mod tests {
             images: vec![format!("{rows}.jpg")],
             benches: vec![rows],
             places_m: vec![Vector2::new(0.1 + 0.2, 1.0 / 3.0)],
+            sightings: vec![(1, 2)],
         };
         let fused = Fused { doubts: (0..12).map(bench).collect(), ..Fused::default() };
         let watch = Watch::default();

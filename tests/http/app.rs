@@ -193,6 +193,7 @@ fn model(subject: &Subject, options: &MapOptions, columns: u32) -> PlantModel {
         reference: GeodeticReference::new(Lla { latitude_deg: 50.0, longitude_deg: 8.0, height_m: 100.0 }),
         vertical_datum: "as the drone wrote it".to_owned(),
         alignment: None,
+        parameters: None,
         lines: vec![Line { id: line, label: "L01".to_owned(), index: 1 }],
         benches: vec![Bench {
             id: bench,

@@ -31,6 +31,7 @@ fn plant_of(layout: &[&[u32]]) -> PlantModel {
         reference: GeodeticReference::new(Lla { latitude_deg: 49.8, longitude_deg: 14.0, height_m: 400.0 }),
         vertical_datum: "unknown".to_owned(),
         alignment: None,
+        parameters: None,
         lines: Vec::new(),
         benches: Vec::new(),
         sectors: Vec::new(),

@@ -8,6 +8,7 @@ use crate::layout::Layout;
 use crate::reconstruction::{self, Photo, Project, ProjectFolder, Shot};
 use crate::refinement::{self, Refined, RefinementOptions};
 use heliomap_model::{PlantId, PlantModel, Warning};
+use parameters::Parameters;
 use progress::Clock;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -15,9 +16,11 @@ use std::io::{self, Write};
 use std::path::Path;
 use std::sync::Arc;
 
+mod coverage;
 mod error;
 mod images;
 mod options;
+mod parameters;
 mod progress;
 pub mod search;
 
@@ -98,8 +101,8 @@ pub fn map_folder(
 
     let seen = match boxes {
         Boxes::Detector(detector) => {
-            let chosen = images::resolving(&project, &gsd_m, options, &mut warnings);
-            images::search(folder, &project, &chosen, &gsd_m, detector, options.max_image_pixels, &mut clock)?
+            let search = images::Search { folder, project: &project, gsd_m: &gsd_m, detector, options };
+            images::search_all(&search, &cloud, &mut clock, &mut warnings)?
         }
         Boxes::File(path) => images::from_boxes(folder, &project, path, &gsd_m, options, &mut clock, &mut warnings)?,
     };
@@ -161,15 +164,16 @@ pub fn map_folder(
         survey: &subject.survey,
         previous: subject.previous.as_deref(),
     };
-    let model = clock.stage(Stage::Assemble, || {
+    let mut model = clock.stage(Stage::Assemble, || {
         assemble(&views, &fused, &refined, reference, options.datum(), &identity, warnings)
     })?;
+    model.parameters = Some(Parameters::usual().digest());
     let timings = clock.timings;
     Ok(Mapping { model, timings, photos, shots, detections, layouts, fused, refined })
 }
 
 /// Changes with what [`Fused`] holds, so that checkpoints of an older program are discarded and not misread.
-const STRUCTURE_VERSION: u32 = 2;
+const STRUCTURE_VERSION: u32 = 3;
 
 /// SHA-256 of the detections and layouts, hexadecimal: the key of the structure's checkpoint.
 fn digest(detections: &[ImageDetections], layouts: &[Layout]) -> String {
@@ -202,7 +206,7 @@ pub fn photos_of(folder: &dyn ProjectFolder, max_image_pixels: u64) -> Result<Ve
     let mut project = reconstruction::opensfm::read(folder, max_image_pixels)?;
     let cloud = cloud_of(&mut project);
     let gsd_m = images::ground_sampling_distances(&project.reconstruction.shots, &cloud);
-    let chosen = images::resolving(&project, &gsd_m, &MapOptions::default(), &mut Vec::new());
+    let chosen = images::resolving(&gsd_m, &MapOptions::default(), &mut Vec::new());
     Ok(chosen.into_iter().map(|shot| (project.photos[shot].clone(), gsd_m[shot])).collect())
 }
 

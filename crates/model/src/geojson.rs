@@ -74,6 +74,9 @@ impl PlantModel {
         if let Some(alignment) = &self.alignment {
             members.insert("alignment".to_owned(), json!(alignment));
         }
+        if let Some(parameters) = &self.parameters {
+            members.insert("parameters".to_owned(), json!(parameters));
+        }
         members
     }
 

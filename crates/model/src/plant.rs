@@ -152,6 +152,9 @@ pub struct PlantModel {
     /// How it was brought onto known places, if any were given.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub alignment: Option<Alignment>,
+    /// Digest of the parameters that it was mapped with; models of equal digests can be compared.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub parameters: Option<String>,
     pub lines: Vec<Line>,
     pub benches: Vec<Bench>,
     pub sectors: Vec<Sector>,

@@ -282,6 +282,9 @@ struct FeatureCollection {
     /// What heights refer to.
     #[schema(example = "height above the WGS84 ellipsoid")]
     vertical_datum: String,
+    /// Digest of the parameters that the model was mapped with: models of equal digests can be compared.
+    #[schema(required = false, example = "9f2c1d7e40b6a853")]
+    parameters: Option<String>,
     #[schema(example = json!([]))]
     warnings: Vec<Value>,
     /// With `limit`: how many features these are.

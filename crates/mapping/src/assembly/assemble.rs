@@ -40,6 +40,7 @@ pub fn assemble(
         reference,
         vertical_datum,
         alignment: refined.alignment.clone(),
+        parameters: None,
         lines: Vec::new(),
         benches: Vec::new(),
         sectors: Vec::new(),

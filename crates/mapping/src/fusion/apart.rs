@@ -1,17 +1,10 @@
 //! Pieces of one image that are two benches: gaps and aisles lie between them. The pixels of one image tell that more finely
 //! than positions do.
 
-use super::LocatedPiece;
 use super::cluster::{Link, Table};
 use super::locate::LocatedCell;
+use super::{FusionParams, LocatedPiece};
 use nalgebra::Vector2;
-
-/// Cost of two pieces of one image, with a gap between them that is no whole number of modules, in one bench.
-const GAP_COST: f64 = 12.0;
-/// More than usual between two rows, in parts of the shorter pitch: an aisle.
-const AISLE: f64 = 0.1;
-/// Fewest columns by which an aisle is told.
-const LEAST_COLUMNS: usize = 6;
 
 /// Two pieces of one image, one behind the other.
 pub(super) struct Facing {
@@ -30,9 +23,7 @@ fn larger_first(a: usize, b: usize, pieces: &[LocatedPiece]) -> Option<(usize, u
 }
 
 /// Whether two pieces are of one image and stand one behind the other.
-pub(super) fn facing(a: usize, b: usize, pieces: &[LocatedPiece]) -> Option<Facing> {
-    /// Farther off a lattice is too little known to tell, columns.
-    const NEAR: f64 = 3.0;
+pub(super) fn facing(a: usize, b: usize, pieces: &[LocatedPiece], params: &FusionParams) -> Option<Facing> {
     let (base_piece, part_piece) = larger_first(a, b, pieces)?;
     let (base, part) = (&pieces[base_piece], &pieces[part_piece]);
     let outside = |at: &Vector2<f64>| (-at.x).max(at.x - f64::from(base.cols - 1));
@@ -47,16 +38,21 @@ pub(super) fn facing(a: usize, b: usize, pieces: &[LocatedPiece]) -> Option<Faci
     let (west, east) = if is_west { (part_piece, base_piece) } else { (base_piece, part_piece) };
     let row_shift = nearest.y.round() as i32 - cell.row;
     let shift = if is_west { row_shift } else { -row_shift };
-    let (beyond, rows) = steps_between(&pieces[west], &pieces[east], 0, shift).unwrap_or((outside(&nearest), 0));
-    (0.5..NEAR).contains(&beyond).then_some(Facing { west, east, beyond, rows })
+    let (beyond, rows) =
+        steps_between(&pieces[west], &pieces[east], 0, shift, params.pitch_span).unwrap_or((outside(&nearest), 0));
+    (0.5..params.gap_reach).contains(&beyond).then_some(Facing { west, east, beyond, rows })
 }
 
 /// How many columns (axis 0) or rows (axis 1) apart the facing sides of two pieces of one image stand, by the pixels of the
 /// rows or columns that both have, and how many these are; `None` where neither shows its pitch. Their numbers in `second`
 /// are those in `first` plus the shift.
-fn steps_between(first: &LocatedPiece, second: &LocatedPiece, axis: usize, shift: i32) -> Option<(f64, usize)> {
-    /// Steps over which the pitch at a side is measured.
-    const SPAN: i32 = 4;
+fn steps_between(
+    first: &LocatedPiece,
+    second: &LocatedPiece,
+    axis: usize,
+    shift: i32,
+    span: i32,
+) -> Option<(f64, usize)> {
     let place = |cell: &LocatedCell| if axis == 0 { (cell.col, cell.row) } else { (cell.row, cell.col) };
     let size = |piece: &LocatedPiece| if axis == 0 { (piece.cols, piece.rows) } else { (piece.rows, piece.cols) };
     // The outermost module, how far within the piece it stands, and pixels per step there.
@@ -65,7 +61,7 @@ fn steps_between(first: &LocatedPiece, second: &LocatedPiece, axis: usize, shift
         let inwards = |cell: &LocatedCell| if at_last { size(piece).0 - 1 - place(cell).0 } else { place(cell).0 };
         let outermost = cells.clone().min_by_key(|cell| inwards(cell))?;
         let steps = |cell: &LocatedCell| place(cell).0 - place(outermost).0;
-        let inner = cells.filter(|cell| (1..=SPAN).contains(&steps(cell).abs())).max_by_key(|cell| steps(cell).abs());
+        let inner = cells.filter(|cell| (1..=span).contains(&steps(cell).abs())).max_by_key(|cell| steps(cell).abs());
         let pitch = inner.map(|cell| (cell.center_px - outermost.center_px) / f64::from(steps(cell)));
         Some((outermost.center_px, f64::from(inwards(outermost)), pitch))
     };
@@ -87,7 +83,7 @@ fn steps_between(first: &LocatedPiece, second: &LocatedPiece, axis: usize, shift
 
 /// Two pieces of one image, one beside the other, with more than a seam between their rows: tables that face each other, or
 /// stand one above the other.
-pub(super) fn aisle_between(a: usize, b: usize, pieces: &[LocatedPiece]) -> Option<Link> {
+pub(super) fn aisle_between(a: usize, b: usize, pieces: &[LocatedPiece], params: &FusionParams) -> Option<Link> {
     let (base_piece, part_piece) = larger_first(a, b, pieces)?;
     let (base, part) = (&pieces[base_piece], &pieces[part_piece]);
     let cell = part.cells.iter().filter(|cell| cell.detection.is_some()).find_map(|cell| {
@@ -97,23 +93,26 @@ pub(super) fn aisle_between(a: usize, b: usize, pieces: &[LocatedPiece]) -> Opti
     });
     let (col, at) = cell?;
     let shift = at.x.round() as i32 - col;
-    let (apart, columns) =
-        if at.y < 0.0 { steps_between(part, base, 1, shift) } else { steps_between(base, part, 1, -shift) }?;
+    let (apart, columns) = if at.y < 0.0 {
+        steps_between(part, base, 1, shift, params.pitch_span)
+    } else {
+        steps_between(base, part, 1, -shift, params.pitch_span)
+    }?;
     let [u, v] = base.pitch_m();
     let narrow = (u.norm() / v.norm()).min(1.0);
-    (columns >= LEAST_COLUMNS && ((1.0 + AISLE * narrow)..2.0).contains(&apart)).then(|| Link {
+    (columns >= params.aisle_least_columns && ((1.0 + params.aisle * narrow)..2.0).contains(&apart)).then(|| Link {
         a: base_piece,
         b: part_piece,
-        table: Table::new([], GAP_COST, 0.0),
+        table: Table::new([], params.gap_cost, 0.0),
     })
 }
 
 /// Two pieces of one image, one behind the other, that no one lattice fits: a gap lies between them, and they are two
 /// benches. Pixels tell that more finely than the cloud.
-pub(super) fn gap_between(facing: &Facing) -> Option<Link> {
+pub(super) fn gap_between(facing: &Facing, params: &FusionParams) -> Option<Link> {
     let Facing { west, east, beyond, rows } = *facing;
     let off = (beyond - beyond.round()).abs();
     // One row alone errs by as much as a narrow gap.
     let least = if rows > 1 { 0.1 + 0.02 * beyond } else { 0.15 + 0.03 * beyond };
-    (off >= least).then(|| Link { a: west, b: east, table: Table::new([], GAP_COST, 0.0) })
+    (off >= least).then(|| Link { a: west, b: east, table: Table::new([], params.gap_cost, 0.0) })
 }

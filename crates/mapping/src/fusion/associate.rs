@@ -9,38 +9,14 @@
 use super::apart::{Facing, aisle_between, facing, gap_between};
 use super::cameras::CameraQuality;
 use super::cluster::{Best, Link, Partition, Shift, Table, partition};
-use super::disparity::{Disparity, DisparityField, PRIOR_SIGMA_M};
-use super::{Doubt, FusionOptions, LocatedPiece, OpenDoubt, View};
+use super::disparity::{Disparity, DisparityField};
+use super::{Doubt, FusionOptions, FusionParams, LocatedPiece, OpenDoubt, View};
 use crate::layout::End;
 use nalgebra::{Matrix3, Vector2, Vector3};
 use rayon::prelude::*;
 use rstar::{AABB, RTree, primitives::GeomWithData};
 use std::collections::BTreeMap;
 use std::f64::consts::SQRT_2;
-
-/// Cost, in units of a negative log-likelihood, of one bench end that one view sees and the other contradicts.
-const END_COST: f64 = 4.0;
-/// Cost of each further column by which it is contradicted.
-const END_COLUMN_COST: f64 = 1.0;
-/// Cost of a place that is a module in one view and a hole in the other.
-const HOLE_COST: f64 = 1.0;
-/// Most that it costs two pieces to share no module at all.
-const APART_COST: f64 = 0.5;
-/// Margin between the best and the second best shift above which a pair is beyond doubt.
-const SURE: f64 = 5.0;
-/// Margin above which a pair counts at all.
-const LIKELY: f64 = 2.5;
-/// Cost of pieces that show the same ground being different benches after all: as much as two contradicted ends.
-const DIFFERENT_COST: f64 = 2.0 * END_COST + 2.0;
-/// Cost of a shift that positions do not allow.
-const FAR_COST: f64 = 12.0;
-/// Share of the greatest displacement that is looked for, above which shifts are looked for about the one that is known.
-const DISPLACED: f64 = 0.25;
-/// Degrees of freedom of the positions' errors: few, for local errors of structure from motion have long tails.
-const TAIL: f64 = 4.0;
-
-/// How much more the height of a bench may disagree than its place, two views' errors being what they are.
-const HEIGHT_SHARE: f64 = 2.0;
 
 /// A shift under which two pieces may be the same: column and row of `b` are those of `a` plus this.
 #[derive(Debug, Clone, Copy)]
@@ -133,6 +109,7 @@ impl Undecided {
                 ),
                 images: vec![name(*a), name(*b)],
                 benches: Vec::new(),
+                sightings: Vec::new(),
                 places_m,
             },
             Self::Unsure { a, b, choices, margin } => {
@@ -151,6 +128,7 @@ impl Undecided {
                     ),
                     images: vec![name(*a), name(*b)],
                     benches: Vec::new(),
+                    sightings: Vec::new(),
                     places_m,
                 }
             }
@@ -174,25 +152,26 @@ pub struct Clusters {
 
 /// Finds the benches.
 pub(super) fn associate(pieces: &[LocatedPiece], cameras: Option<&CameraQuality>, options: &FusionOptions) -> Clusters {
+    let params = &options.params;
     let near = near_pairs(pieces, options);
     let mut pairs: Vec<Pair> =
         near.par_iter().filter_map(|&(a, b)| pair(a, b, pieces, Vector2::zeros(), options)).collect();
-    let facing: Vec<Facing> = near.par_iter().filter_map(|&(a, b)| facing(a, b, pieces)).collect();
-    let mut apart: Vec<Link> = facing.iter().filter_map(gap_between).collect();
-    apart.par_extend(near.par_iter().filter_map(|&(a, b)| aisle_between(a, b, pieces)));
+    let facing: Vec<Facing> = near.par_iter().filter_map(|&(a, b)| facing(a, b, pieces, params)).collect();
+    let mut apart: Vec<Link> = facing.iter().filter_map(|facing| gap_between(facing, params)).collect();
+    apart.par_extend(near.par_iter().filter_map(|&(a, b)| aisle_between(a, b, pieces, params)));
     let views = pieces.iter().map(|piece| piece.view + 1).max().unwrap_or(0);
-    let prior_m = cameras.map_or(PRIOR_SIGMA_M, |cameras| SQRT_2 * cameras.typical_m);
-    let mut field = DisparityField::unknown(views, prior_m);
+    let prior_m = cameras.map_or(params.view_sigma_m, |cameras| SQRT_2 * cameras.typical_m);
+    let mut field = DisparityField::unknown(views, prior_m, params);
     let weigh = |k: usize, pair: &Pair, field: &DisparityField| match cameras {
         Some(cameras) => geometric_table(k, pair, pieces, field, cameras, options),
-        None => table(k, pair, pieces, field),
+        None => table(k, pair, pieces, field, params),
     };
-    for needed in [SURE, LIKELY, LIKELY] {
+    for needed in [params.sure_margin, params.likely_margin, params.likely_margin] {
         let known = disparities(&pairs, pieces, |k| {
             let best = weigh(k, &pairs[k], &field).best()?;
             (best.margin >= needed).then_some(best.shift)
         });
-        field = DisparityField::fit(views, &known, prior_m);
+        field = DisparityField::fit(views, &known, prior_m, params);
     }
     let mut outcome = None;
     for _ in 0..2 {
@@ -203,14 +182,14 @@ pub(super) fn associate(pieces: &[LocatedPiece], cameras: Option<&CameraQuality>
             .map(|(k, pair)| Link { a: pair.a, b: pair.b, table: weigh(k, pair, &field) })
             .collect();
         links.extend(apart.iter().cloned());
-        let joined = partition(pieces, &links, LIKELY);
+        let joined = partition(pieces, &links, params);
         // All joints together know more of the displacements than single pairs did.
         let known = disparities(&pairs, pieces, |k| joined.between(pairs[k].a, pairs[k].b));
-        field = DisparityField::fit(views, &known, prior_m);
+        field = DisparityField::fit(views, &known, prior_m, params);
         outcome = Some((joined, links));
     }
     match outcome {
-        Some((joined, links)) => clusters(&joined, &links, &facing),
+        Some((joined, links)) => clusters(&joined, &links, &facing, params),
         None => Clusters {
             placements: Vec::new(),
             members: Vec::new(),
@@ -226,7 +205,7 @@ fn look_about(pairs: &mut [Pair], field: &DisparityField, pieces: &[LocatedPiece
     pairs.par_iter_mut().enumerate().for_each(|(k, known)| {
         let views = (pieces[known.a].view, pieces[known.b].view);
         let (expected_m, _) = field.expected(k, views, known.at_m);
-        if expected_m.norm() > DISPLACED * options.max_disparity_m
+        if expected_m.norm() > options.params.displaced_share * options.max_disparity_m
             && let Some(wider) = pair(known.a, known.b, pieces, expected_m, options)
         {
             *known = wider;
@@ -253,18 +232,19 @@ fn disparities(
 }
 
 /// What a pair says of every shift.
-fn table(index: usize, pair: &Pair, pieces: &[LocatedPiece], field: &DisparityField) -> Table {
+fn table(index: usize, pair: &Pair, pieces: &[LocatedPiece], field: &DisparityField, params: &FusionParams) -> Table {
+    let dof = params.position_dof;
     let (a, b) = (&pieces[pair.a], &pieces[pair.b]);
     let (expected, field_sigma) = field.expected(index, (a.view, b.view), pair.at_m);
     let sigma = (field_sigma.powi(2) + a.sigma_m.powi(2) + b.sigma_m.powi(2)).sqrt();
     let cost = |hypothesis: &Hypothesis| {
         let off = (hypothesis.disparity_m - expected).norm() / sigma;
         // Student's t in the plane: positions may be wrong by far more than they admit.
-        hypothesis.structure_cost + (TAIL + 2.0) / 2.0 * (1.0 + off * off / TAIL).ln()
+        hypothesis.structure_cost + (dof + 2.0) / 2.0 * (1.0 + off * off / dof).ln()
     };
     // Two that show no module in common need not be of one bench, wherever they stand.
-    let apart = pair.hypotheses.iter().filter(|h| !h.shares).map(&cost).fold(DIFFERENT_COST, f64::min);
-    Table::new(pair.hypotheses.iter().map(|h| ((h.col, h.row), cost(h))), FAR_COST, apart)
+    let apart = pair.hypotheses.iter().filter(|h| !h.shares).map(&cost).fold(params.different_cost, f64::min);
+    Table::new(pair.hypotheses.iter().map(|h| ((h.col, h.row), cost(h))), params.far_cost, apart)
 }
 
 /// What a pair says of every shift where cameras are good: rays of the same module meet, those of neighbours do not.
@@ -286,7 +266,7 @@ fn geometric_table(
         let off = match &hypothesis.in_space {
             Some((off, covariance)) => {
                 let off = off - Vector3::new(expected.x, expected.y, 0.0);
-                let height = HEIGHT_SHARE * sigma;
+                let height = options.params.height_factor * sigma;
                 let shared = Vector3::new(sigma * sigma, sigma * sigma, height * height);
                 (covariance + Matrix3::from_diagonal(&shared)).cholesky().map_or(0.0, |c| off.dot(&c.solve(&off)))
             }
@@ -297,8 +277,8 @@ fn geometric_table(
         };
         hypothesis.structure_cost + (dof + 3.0) / 2.0 * (1.0 + off / dof).ln()
     };
-    let apart = pair.hypotheses.iter().filter(|h| !h.shares).map(&cost).fold(DIFFERENT_COST, f64::min);
-    Table::new(pair.hypotheses.iter().map(|h| ((h.col, h.row), cost(h))), FAR_COST, apart)
+    let apart = pair.hypotheses.iter().filter(|h| !h.shares).map(&cost).fold(options.params.different_cost, f64::min);
+    Table::new(pair.hypotheses.iter().map(|h| ((h.col, h.row), cost(h))), options.params.far_cost, apart)
 }
 
 /// Where the lattice of `b` has a place that both show, or that lies between them, less where that of `a` has it, metres, with
@@ -314,7 +294,7 @@ fn in_space(a: &LocatedPiece, b: &LocatedPiece, col: i32, row: i32) -> Option<(V
 }
 
 /// The benches of a partition, numbered by their first piece, with what it leaves open.
-fn clusters(joined: &Partition, links: &[Link], facing: &[Facing]) -> Clusters {
+fn clusters(joined: &Partition, links: &[Link], facing: &[Facing], params: &FusionParams) -> Clusters {
     let mut faced = vec![[false; 2]; joined.set.len()];
     for pair in facing {
         faced[pair.west][1] = true;
@@ -343,20 +323,25 @@ fn clusters(joined: &Partition, links: &[Link], facing: &[Facing]) -> Clusters {
             placements[*piece].row -= low_row;
         }
     }
-    let doubts = undecided(joined, links, &number);
+    let doubts = undecided(joined, links, &number, params);
     Clusters { placements, members, margins, faced, doubts }
 }
 
 /// What is left open: in each bench the clearest pair that contradicts it, and sets of pieces that lie over each other
 /// without a sure shift.
-fn undecided(joined: &Partition, links: &[Link], number: &BTreeMap<usize, usize>) -> Vec<Undecided> {
+fn undecided(
+    joined: &Partition,
+    links: &[Link],
+    number: &BTreeMap<usize, usize>,
+    params: &FusionParams,
+) -> Vec<Undecided> {
     let mut conflicts: BTreeMap<usize, (f64, Undecided)> = BTreeMap::new();
     let mut open: BTreeMap<(usize, usize), (usize, usize, Table)> = BTreeMap::new();
     for link in links {
         let (a, b) = (number[&joined.set[link.a]], number[&joined.set[link.b]]);
         if a == b {
             let (Some(best), Some(placed)) = (link.table.best(), joined.between(link.a, link.b)) else { continue };
-            if best.margin < SURE || best.shift == placed {
+            if best.margin < params.sure_margin || best.shift == placed {
                 continue;
             }
             let pairs = conflicts.get(&a).map_or(0, |(_, doubt)| doubt.pairs()) + 1;
@@ -387,7 +372,7 @@ fn undecided(joined: &Partition, links: &[Link], number: &BTreeMap<usize, usize>
     for (a, b, table) in open.into_values() {
         let Some(Best { shift, cost, second, margin }) = table.best() else { continue };
         // What joins them costs less than what keeps them apart, and yet no shift is sure.
-        if cost + 1.0 < table.apart() && margin < LIKELY {
+        if cost + 1.0 < table.apart() && margin < params.likely_margin {
             let choices = [Some(shift), second].into_iter().flatten().collect();
             doubts.push(Undecided::Unsure { a, b, choices, margin });
         }
@@ -517,7 +502,7 @@ fn pair(
             let (mut structure_cost, shares) = structure_cost(first, second, col, row, options);
             if !shares {
                 // Beside each other they may as well be two benches: nothing is contradicted.
-                structure_cost = structure_cost.min(APART_COST);
+                structure_cost = structure_cost.min(options.params.beside_cost);
             }
             hypotheses.push(Hypothesis { col, row, structure_cost, shares, disparity_m, in_space });
         }
@@ -539,7 +524,8 @@ fn structure_cost(a: &LocatedPiece, b: &LocatedPiece, col: i32, row: i32, option
             }
         }
     }
-    cost += (f64::from(holes) * HOLE_COST).min(3.0 * HOLE_COST + 0.1 * f64::from(holes));
+    let params = &options.params;
+    cost += (f64::from(holes) * params.hole_cost).min(3.0 * params.hole_cost + 0.1 * f64::from(holes));
     // `beyond` columns of one piece lie past the end of the other.
     // Where geometry speaks no end weighs more than the share of ends that are seen wrongly, however far off it is.
     let most =
@@ -548,7 +534,7 @@ fn structure_cost(a: &LocatedPiece, b: &LocatedPiece, col: i32, row: i32, option
         let before = cost;
         let contradicted = if beyond > 0 { mine } else { theirs };
         if beyond != 0 && contradicted == End::Closed {
-            cost += END_COST + END_COLUMN_COST * f64::from(beyond.abs() - 1).min(4.0);
+            cost += params.end_cost + params.end_column_cost * f64::from(beyond.abs() - 1).min(4.0);
             // Both see an end, and not the same.
             if mine == End::Closed && theirs == End::Closed {
                 cost += 1.0;
@@ -563,7 +549,7 @@ fn structure_cost(a: &LocatedPiece, b: &LocatedPiece, col: i32, row: i32, option
     if let Some(known) = options.rows_per_bench {
         let (low, high) = (0.min(row), (a.rows - 1 + row).max(b.rows - 1));
         if high - low + 1 > known as i32 {
-            cost += END_COST;
+            cost += params.end_cost;
         }
     }
     (cost, shared > 0)

@@ -3,7 +3,7 @@
 
 use super::associate::Clusters;
 use super::locate::LocatedCell;
-use super::{Doubt, LocatedPiece, OpenDoubt, View};
+use super::{Doubt, FusionParams, LocatedPiece, OpenDoubt, View};
 use crate::layout::End;
 use nalgebra::{Vector2, Vector3};
 use rstar::RTree;
@@ -55,8 +55,12 @@ pub struct FusedBench {
     pub(super) cluster: usize,
 }
 
-/// What one view alone saw is left out where this many others look at the place and see the bench without it.
-const MANY: usize = 3;
+impl FusedBench {
+    /// What it was seen by: view, and index into the view's detections.
+    pub fn sightings(&self) -> impl Iterator<Item = (usize, usize)> {
+        self.modules.iter().flat_map(|module| module.observations.iter().map(|seen| (seen.view, seen.detection)))
+    }
+}
 
 /// What the views say of one place in a bench.
 #[derive(Default)]
@@ -80,9 +84,12 @@ pub(super) fn assemble(
     views: &[View<'_>],
     pieces: &[LocatedPiece],
     clusters: &Clusters,
+    params: &FusionParams,
     doubts: &mut Vec<OpenDoubt>,
 ) -> Vec<FusedBench> {
-    (0..clusters.members.len()).filter_map(|cluster| assemble_bench(views, pieces, clusters, cluster, doubts)).collect()
+    (0..clusters.members.len())
+        .filter_map(|cluster| assemble_bench(views, pieces, clusters, cluster, params, doubts))
+        .collect()
 }
 
 fn assemble_bench(
@@ -90,6 +97,7 @@ fn assemble_bench(
     pieces: &[LocatedPiece],
     clusters: &Clusters,
     cluster: usize,
+    params: &FusionParams,
     doubts: &mut Vec<OpenDoubt>,
 ) -> Option<FusedBench> {
     let (members, margin) = (&clusters.members[cluster], clusters.margins[cluster]);
@@ -138,7 +146,7 @@ fn assemble_bench(
     let (mut accepted, outvoted): (Places, Places) = votes
         .into_iter()
         .filter(|(_, v)| !v.observations.is_empty())
-        .partition(|(_, v)| v.observed > v.absent.len() / 2 && v.unseen.len() < MANY);
+        .partition(|(_, v)| v.observed > v.absent.len() / 2 && v.unseen.len() < params.many_views);
     let seen_by: BTreeSet<usize> = accepted.values().flat_map(|v| v.observations.iter().map(|o| o.view)).collect();
     // Two boxes that one view alone saw beside each other are no bench.
     if accepted.len() < 2 || (accepted.len() < 4 && seen_by.len() < 2) {
@@ -189,7 +197,7 @@ fn assemble_bench(
     };
     doubts.extend(holes_to_check(views, &bench));
     let kept = accepted.iter().filter(|(_, v)| v.observed <= v.absent.len() || v.unseen.len() > 1);
-    let left_out = outvoted.iter().filter(|(_, v)| v.observed > 1 || v.unseen.len() >= MANY);
+    let left_out = outvoted.iter().filter(|(_, v)| v.observed > 1 || v.unseen.len() >= params.many_views);
     let name = |(row, col): &(i32, i32)| (row - low_row + 1, col - low_col + 1);
     let contested: Vec<Contested<'_>> = kept
         .map(|(place, votes)| Contested { place: name(place), kept: true, votes })
@@ -370,6 +378,7 @@ pub(super) fn without_ghosts(
                 ),
                 images: names.into_iter().collect(),
                 benches: Vec::new(),
+                sightings: bench.sightings().collect(),
                 places_m: vec![bench.middle_m.xy()],
             };
             left_out.push(OpenDoubt { doubt, clusters });
@@ -394,7 +403,7 @@ fn views_missing(views: &[View<'_>], bench: &FusedBench) -> usize {
     // Views may be displaced by as much as poses err, and what stands at the edge is cut.
     let margin_m = 2.0 + bench.pitch_m[0].norm().max(bench.pitch_m[1].norm());
     (0..views.len())
-        .filter(|view| !own.contains(view))
+        .filter(|view| !own.contains(view) && !views[*view].layout.partial)
         .filter(|&view| {
             let (camera, pose) = (&views[view].shot.camera, &views[view].shot.pose);
             let inside = |place: &Vector3<f64>| {
@@ -450,6 +459,7 @@ fn places_to_check(views: &[View<'_>], bench: &FusedBench, contested: &[Conteste
             .map(|view| views[*view].shot.name.clone())
             .collect(),
         benches: Vec::new(),
+        sightings: Vec::new(),
         places_m: vec![bench.middle_m.xy()],
     };
     Some(OpenDoubt { doubt, clusters: vec![bench.cluster] })
@@ -481,6 +491,7 @@ fn holes_to_check(views: &[View<'_>], bench: &FusedBench) -> Option<OpenDoubt> {
         ),
         images: images.into_iter().map(str::to_owned).collect(),
         benches: Vec::new(),
+        sightings: Vec::new(),
         places_m: vec![bench.middle_m.xy()],
     };
     Some(OpenDoubt { doubt, clusters: vec![bench.cluster] })

@@ -9,11 +9,6 @@ use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
-/// Least pairs of pieces by which two views are compared.
-const LEAST_PAIRS: usize = 3;
-/// Weight of the plant's typical camera in the estimate of one, in pairs of views.
-const PRIOR_PAIRS: f64 = 2.0;
-
 /// Standard deviations of what the cameras displace on the ground.
 #[derive(Debug, Clone)]
 pub(super) struct CameraQuality {
@@ -57,7 +52,7 @@ pub(super) fn measure(
     let least = params.camera_least_m * params.camera_least_m;
     let squares: BTreeMap<(usize, usize), f64> = by_views
         .iter()
-        .filter(|(_, squares)| squares.len() >= LEAST_PAIRS)
+        .filter(|(_, squares)| squares.len() >= params.camera_least_pairs)
         .map(|(views, squares)| (*views, median(squares).max(2.0 * least)))
         .collect();
     let all: Vec<f64> = rests.iter().map(|rest| rest.square_m2).collect();
@@ -76,7 +71,7 @@ pub(super) fn measure(
         variances = (0..views)
             .map(|view| {
                 let own = partners[view].iter().map(|&(other, square)| ((square - variances[other]).max(least), 1.0));
-                let prior = std::iter::once((typical, PRIOR_PAIRS));
+                let prior = std::iter::once((typical, params.camera_prior_pairs));
                 weighted_median(own.chain(prior)).unwrap_or(typical)
             })
             .collect();

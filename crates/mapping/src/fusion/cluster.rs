@@ -5,7 +5,7 @@
 //! contraction, Keuper et al. 2015, with shifts for labels); then every piece is tried at every other place that its
 //! pairs allow, until none would stand better elsewhere.
 
-use super::LocatedPiece;
+use super::{FusionParams, LocatedPiece};
 use std::cmp::Ordering;
 use std::collections::{BTreeMap, BTreeSet, BinaryHeap, HashMap};
 
@@ -94,10 +94,10 @@ pub(super) struct Partition {
     pub margin: Vec<f64>,
 }
 
-/// Joins as long as a joint beats every other choice by `least_margin`, then settles every piece.
-pub(super) fn partition(pieces: &[LocatedPiece], links: &[Link], least_margin: f64) -> Partition {
+/// Joins as long as a joint beats every other choice by the least margin that counts, then settles every piece.
+pub(super) fn partition(pieces: &[LocatedPiece], links: &[Link], params: &FusionParams) -> Partition {
     let mut contraction = Contraction::new(pieces, links);
-    contraction.run(least_margin);
+    contraction.run(params.likely_margin);
     let mut partition = contraction.partition;
     let mut of_piece: Vec<Vec<usize>> = vec![Vec::new(); pieces.len()];
     for (index, link) in links.iter().enumerate() {
@@ -105,8 +105,9 @@ pub(super) fn partition(pieces: &[LocatedPiece], links: &[Link], least_margin: f
         of_piece[link.b].push(index);
     }
     for _ in 0..4 {
-        let moved =
-            (0..pieces.len()).filter(|piece| partition.settle(pieces, links, &of_piece[*piece], *piece)).count();
+        let moved = (0..pieces.len())
+            .filter(|piece| partition.settle(pieces, links, &of_piece[*piece], *piece, params.least_gain))
+            .count();
         if moved == 0 {
             break;
         }
@@ -141,9 +142,14 @@ impl Partition {
     }
 
     /// Moves a piece to where it stands best, if that is clearly elsewhere.
-    fn settle(&mut self, pieces: &[LocatedPiece], links: &[Link], of_piece: &[usize], piece: usize) -> bool {
-        /// What a move must gain at least.
-        const GAIN: f64 = 0.5;
+    fn settle(
+        &mut self,
+        pieces: &[LocatedPiece],
+        links: &[Link],
+        of_piece: &[usize],
+        piece: usize,
+        least_gain: f64,
+    ) -> bool {
         let tables = self.tables(links, of_piece, piece);
         let (home, here) = (self.set[piece], self.shift[piece]);
         let gain = |set: usize, shift: Shift| tables.get(&set).map_or(0.0, |table| table.apart - table.cost(shift));
@@ -155,7 +161,7 @@ impl Partition {
                 choices.push((gain(*set, *shift), Some((*set, *shift))));
             }
         }
-        choices.retain(|(gain, _)| *gain > now + GAIN);
+        choices.retain(|(gain, _)| *gain > now + least_gain);
         choices.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
         for (_, choice) in choices {
             match choice {

@@ -1,14 +1,8 @@
 //! How the positions of two views disagree.
 
+use super::FusionParams;
 use nalgebra::Vector2;
 use std::collections::BTreeMap;
-
-/// Standard deviation of the disagreement of two views where nothing is known of the cameras, metres.
-pub(super) const PRIOR_SIGMA_M: f64 = 0.35;
-/// Least one that is learned, metres.
-const LEAST_SIGMA_M: f64 = 0.05;
-/// Within about this distance disagreements are alike, metres.
-const ALIKE_M: f64 = 15.0;
 
 /// What one pair of pieces says: position by the second view less position by the first, at a place. Metres.
 #[derive(Debug, Clone, Copy)]
@@ -23,6 +17,8 @@ pub(super) struct Disparity {
 pub(super) struct DisparityField {
     offset_m: Vec<Vector2<f64>>,
     sigma_m: f64,
+    least_sigma_m: f64,
+    alike_m: f64,
     /// What is left for each pair of views.
     local: BTreeMap<(usize, usize), Vec<Residual>>,
 }
@@ -35,13 +31,19 @@ struct Residual {
 }
 
 impl DisparityField {
-    pub(super) fn unknown(views: usize, prior_m: f64) -> Self {
-        Self { offset_m: vec![Vector2::zeros(); views], sigma_m: prior_m, local: BTreeMap::new() }
+    pub(super) fn unknown(views: usize, prior_m: f64, params: &FusionParams) -> Self {
+        Self {
+            offset_m: vec![Vector2::zeros(); views],
+            sigma_m: prior_m,
+            least_sigma_m: params.view_least_sigma_m,
+            alike_m: params.view_alike_m,
+            local: BTreeMap::new(),
+        }
     }
 
     /// Fits the displacement of each view (Gauss-Seidel on the normal equations, with a weak pull to nought), robustly.
-    pub(super) fn fit(views: usize, known: &[Disparity], prior_m: f64) -> Self {
-        let mut field = Self::unknown(views, prior_m);
+    pub(super) fn fit(views: usize, known: &[Disparity], prior_m: f64, params: &FusionParams) -> Self {
+        let mut field = Self::unknown(views, prior_m, params);
         if known.is_empty() {
             return field;
         }
@@ -78,7 +80,7 @@ impl DisparityField {
         // Median of a Rayleigh distribution is 1.18 sigma.
         let spread = residuals[residuals.len() / 2] / 1.18;
         let trust = known.len() as f64 / (known.len() as f64 + 6.0);
-        field.sigma_m = (spread * trust + prior_m * (1.0 - trust)).clamp(LEAST_SIGMA_M.min(prior_m), prior_m);
+        field.sigma_m = (spread * trust + prior_m * (1.0 - trust)).clamp(field.least_sigma_m.min(prior_m), prior_m);
         field
     }
 
@@ -89,7 +91,7 @@ impl DisparityField {
         let prior = 1.0;
         let (mut sum, mut weight) = (Vector2::zeros(), prior);
         for residual in near.iter().filter(|residual| residual.pair != pair) {
-            let w = 4.0 * (-(residual.at_m - at_m).norm_squared() / (2.0 * ALIKE_M * ALIKE_M)).exp();
+            let w = 4.0 * (-(residual.at_m - at_m).norm_squared() / (2.0 * self.alike_m * self.alike_m)).exp();
             sum += residual.rest_m * w;
             weight += w;
         }

@@ -1,17 +1,8 @@
 //! Benches one behind the other form lines.
 
-use super::{Doubt, FusedBench, OpenDoubt};
+use super::{Doubt, FusedBench, FusionParams, OpenDoubt};
 use nalgebra::Vector2;
 use serde::{Deserialize, Serialize};
-
-/// How far apart the ends of two benches of one line may stand (a road lies between them), metres.
-const WIDEST_M: f64 = 15.0;
-/// How far the axes of two benches of one line may be turned against each other, degrees.
-const BEND_DEG: f64 = 12.0;
-/// Benches of one line face each other by their ends: how far aside of each other their middles may stand, as a share of
-/// half their widths together, and up to where it is doubtful.
-const ASIDE: f64 = 0.85;
-const DOUBTFUL_ASIDE: f64 = 1.05;
 
 /// A line: its benches from the west.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -49,10 +40,14 @@ impl Footprint {
 
 /// Groups benches into lines and sorts both: lines from the north, benches from the west (where rows run north-south:
 /// lines from the east, benches from the north).
-pub(super) fn arrange(benches: Vec<FusedBench>, doubts: &mut Vec<OpenDoubt>) -> (Vec<FusedLine>, Vec<FusedBench>) {
+pub(super) fn arrange(
+    benches: Vec<FusedBench>,
+    params: &FusionParams,
+    doubts: &mut Vec<OpenDoubt>,
+) -> (Vec<FusedLine>, Vec<FusedBench>) {
     let footprints: Vec<Footprint> = benches.iter().map(Footprint::of).collect();
     let count = benches.len();
-    let cell_m = WIDEST_M;
+    let cell_m = params.line_gap_m;
     let key = |p: Vector2<f64>| ((p.x / cell_m).floor() as i64, (p.y / cell_m).floor() as i64);
     let mut wests: std::collections::HashMap<(i64, i64), Vec<usize>> = std::collections::HashMap::new();
     for (index, footprint) in footprints.iter().enumerate() {
@@ -67,18 +62,18 @@ pub(super) fn arrange(benches: Vec<FusedBench>, doubts: &mut Vec<OpenDoubt>) -> 
             for dy in -2..=2 {
                 for &j in wests.get(&(home.0 + dx, home.1 + dy)).into_iter().flatten() {
                     let to = &footprints[j];
-                    if i == j || from.along.angle(&to.along) > BEND_DEG.to_radians() {
+                    if i == j || from.along.angle(&to.along) > params.line_bend_deg.to_radians() {
                         continue;
                     }
                     let offset = to.west - from.east;
                     let (gap, aside) = (offset.dot(&from.along), offset.dot(&from.across));
                     let within = |share: f64| aside.abs() < share * (from.half_m + to.half_m) + 0.05 * gap;
-                    if !(-1.0..WIDEST_M).contains(&gap) {
+                    if !(-1.0..params.line_gap_m).contains(&gap) {
                         continue;
                     }
-                    if within(ASIDE) {
+                    if within(params.line_aside) {
                         facing.push((gap.max(0.0) + 2.0 * aside.abs(), i, j));
-                    } else if within(DOUBTFUL_ASIDE) {
+                    } else if within(params.line_doubtful_aside) {
                         doubtful.push((i, j));
                     }
                 }
@@ -96,7 +91,7 @@ pub(super) fn arrange(benches: Vec<FusedBench>, doubts: &mut Vec<OpenDoubt>) -> 
     }
     let touching = |(i, next): (usize, &Option<usize>)| next.map(|j| (i, j));
     let joined: Vec<(usize, usize)> = next.iter().enumerate().filter_map(touching).collect();
-    doubts.extend(joined.into_iter().filter_map(|(i, j)| bench_or_hole(&benches[i], &benches[j])));
+    doubts.extend(joined.into_iter().filter_map(|(i, j)| bench_or_hole(&benches[i], &benches[j], params)));
     doubtful.sort_unstable();
     doubts.extend(
         doubtful
@@ -163,6 +158,7 @@ fn line_unsure(west: &FusedBench, east: &FusedBench) -> OpenDoubt {
         ),
         images: Vec::new(),
         benches: Vec::new(),
+        sightings: Vec::new(),
         places_m: vec![from, to],
     };
     OpenDoubt { doubt, clusters: vec![west.cluster, east.cluster] }
@@ -170,10 +166,7 @@ fn line_unsure(west: &FusedBench, east: &FusedBench) -> OpenDoubt {
 
 /// Two benches that one lattice fits, with empty columns between them: they may be one bench whose modules are missing
 /// there.
-fn bench_or_hole(west: &FusedBench, east: &FusedBench) -> Option<OpenDoubt> {
-    /// Most empty columns, and how far off the lattice of the one the other may stand, columns and rows.
-    const MOST_EMPTY: f64 = 4.0;
-    const ON_LATTICE: f64 = 0.06;
+fn bench_or_hole(west: &FusedBench, east: &FusedBench, params: &FusionParams) -> Option<OpenDoubt> {
     if west.rows != east.rows {
         return None;
     }
@@ -190,8 +183,8 @@ fn bench_or_hole(west: &FusedBench, east: &FusedBench) -> Option<OpenDoubt> {
     let (column, row) = (offset.perp(&v) / area, u.perp(&offset) / area);
     let empty = column - f64::from(west.cols);
     let whole = empty.round();
-    let on_lattice = (empty - whole).abs() < ON_LATTICE && row.abs() < ON_LATTICE;
-    (on_lattice && (1.0..=MOST_EMPTY).contains(&whole)).then(|| {
+    let on_lattice = (empty - whole).abs() < params.hole_off_lattice && row.abs() < params.hole_off_lattice;
+    (on_lattice && (1.0..=params.hole_most_columns).contains(&whole)).then(|| {
         let middles = [west.middle_m.xy(), east.middle_m.xy()];
         let doubt = Doubt {
             code: "bench_or_hole".into(),
@@ -203,6 +196,7 @@ fn bench_or_hole(west: &FusedBench, east: &FusedBench) -> Option<OpenDoubt> {
             ),
             images: Vec::new(),
             benches: Vec::new(),
+            sightings: Vec::new(),
             places_m: middles.to_vec(),
         };
         OpenDoubt { doubt, clusters: vec![west.cluster, east.cluster] }

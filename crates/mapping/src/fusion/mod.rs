@@ -9,6 +9,7 @@ mod cluster;
 mod disparity;
 pub mod lines;
 pub mod locate;
+mod params;
 mod piece_lattice;
 mod pitch;
 mod relocate;
@@ -22,6 +23,7 @@ use cameras::CameraQuality;
 pub use lines::FusedLine;
 pub use locate::{Located, LocatedPiece};
 use nalgebra::Vector2;
+pub use params::FusionParams;
 use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
 use std::collections::HashMap;
@@ -50,90 +52,6 @@ impl Default for FusionOptions {
     }
 }
 
-/// How geometry decides which modules are the same. Values are measured on the twins of the paper's plants and on
-/// simulated flights unless another source is given.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct FusionParams {
-    /// Standard deviation of the centre of a box, pixels, before it is measured.
-    pub box_sigma_px: f64,
-    /// Least standard deviation of what all boxes of a piece have in common, pixels (detectors see the edge of a table
-    /// otherwise than a seam).
-    pub shared_sigma_px: f64,
-    /// How well a piece's depth is known by cloud or ground before its pitch tells, metres: sparse points lie on the ground,
-    /// one to two metres below the tables.
-    pub depth_sigma_m: f64,
-    /// Slope of a row against the cloud's surface, radians: terrain.
-    pub slope_sigma: f64,
-    /// How far a bench bends from straight over half its length, metres.
-    pub bend_sigma_m: f64,
-    /// How far from a right angle a table may be, as the cosine.
-    pub square_sigma: f64,
-    /// Boxes that a piece needs to take part in measuring the pitch.
-    pub pitch_least_boxes: usize,
-    /// Least angle between the rays of two views that measure it, radians.
-    pub pitch_least_angle_rad: f64,
-    /// Most pairs of pieces that are triangulated for it.
-    pub pitch_most_pairs: usize,
-    /// How far shifts are tried about the positions by the cloud, metres.
-    pub pitch_reach_m: f64,
-    /// Most mean squared residual of a triangulated pair, in variances of a box.
-    pub pitch_most_residual: f64,
-    /// Relative width in which pitches count as equal.
-    pub pitch_window: f64,
-    /// Relative standard deviation of a pitch by the cloud's depth alone.
-    pub pitch_rough_sigma: f64,
-    /// Least number and share of the pairs that make a type of bench.
-    pub pitch_least_pairs: usize,
-    pub pitch_least_share: f64,
-    /// Share of the pairs left that must agree; by mere chance 5 to 16 % do.
-    pub pitch_agreeing_share: f64,
-    /// Least relative standard deviation of a pitch.
-    pub pitch_least_sigma: f64,
-    /// Least standard deviation of the rise of a table across its rows, as the sine of its tilt.
-    pub rise_least_sigma: f64,
-    /// Most types of bench.
-    pub most_types: usize,
-    /// Degrees of freedom of the disagreement of two lattices (Student's t): boxes may err together in ways not foreseen.
-    pub disagreement_dof: f64,
-    /// Cameras are good where they disagree by no more than this share of a pitch: then one pair of pieces decides by itself
-    /// (integer ambiguities are fixed at 0.15 cycles, Teunissen 1998).
-    pub good_camera_pitches: f64,
-    /// Least standard deviation of the disagreement of two cameras on the ground, metres.
-    pub camera_least_m: f64,
-    /// Share of the bench ends that a view sees wrongly (boxes missed in clusters): no end weighs more than its logarithm.
-    pub false_end_share: f64,
-}
-
-impl Default for FusionParams {
-    fn default() -> Self {
-        Self {
-            box_sigma_px: 1.0,
-            shared_sigma_px: 0.3,
-            depth_sigma_m: 3.0,
-            slope_sigma: 0.05,
-            bend_sigma_m: 0.1,
-            square_sigma: 0.003,
-            pitch_least_boxes: 8,
-            pitch_least_angle_rad: 0.1,
-            pitch_most_pairs: 3000,
-            pitch_reach_m: 2.5,
-            pitch_most_residual: 25.0,
-            pitch_window: 0.002,
-            pitch_rough_sigma: 0.04,
-            pitch_least_pairs: 6,
-            pitch_least_share: 0.1,
-            pitch_agreeing_share: 0.25,
-            pitch_least_sigma: 0.0015,
-            rise_least_sigma: 0.03,
-            most_types: 8,
-            disagreement_dof: 8.0,
-            good_camera_pitches: 0.15,
-            camera_least_m: 0.02,
-            false_end_share: 0.03,
-        }
-    }
-}
-
 /// A doubt that a person can settle.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Doubt {
@@ -147,6 +65,9 @@ pub struct Doubt {
     pub benches: Vec<usize>,
     /// Where: the middle of everything concerned, left out or not, east and north in metres.
     pub places_m: Vec<Vector2<f64>>,
+    /// What was left out: view, and index into the view's detections.
+    #[serde(default)]
+    pub sightings: Vec<(usize, usize)>,
 }
 
 /// A doubt while benches have no numbers yet: it names the sets of pieces that they are made of.
@@ -183,6 +104,32 @@ pub struct Fused {
     pub camera_sigma_m: Vec<f64>,
 }
 
+impl Fused {
+    /// Leaves out all benches but those marked; doubts about those that go name the others alone.
+    pub fn keep_benches(&mut self, kept: &[bool]) {
+        let mut next = 0;
+        let number: Vec<Option<usize>> = kept
+            .iter()
+            .map(|keep| {
+                let own = keep.then_some(next);
+                next += usize::from(*keep);
+                own
+            })
+            .collect();
+        let renumber =
+            |benches: &mut Vec<usize>| *benches = benches.iter().filter_map(|bench| number[*bench]).collect();
+        let mut keep = kept.iter();
+        self.benches.retain(|_| keep.next().copied().unwrap_or(false));
+        for line in &mut self.lines {
+            renumber(&mut line.benches);
+        }
+        self.lines.retain(|line| !line.benches.is_empty());
+        for doubt in &mut self.doubts {
+            renumber(&mut doubt.benches);
+        }
+    }
+}
+
 /// Fuses located pieces into the structure of the plant. The result does not depend on the order of the views.
 pub fn fuse(views: &[View<'_>], located: Located, options: &FusionOptions) -> Fused {
     fuse_unless(views, located, options, || false).unwrap_or_default()
@@ -213,10 +160,10 @@ pub fn fuse_unless(
     }
     doubts.extend(clusters.doubts.iter().map(|doubt| doubt.describe(views, &pieces, &clusters)));
     go_on()?;
-    let benches = benches::assemble(views, &pieces, &clusters, &mut doubts);
+    let benches = benches::assemble(views, &pieces, &clusters, &options.params, &mut doubts);
     go_on()?;
     let benches = benches::without_ghosts(views, benches, &mut doubts);
-    let (lines, benches) = lines::arrange(benches, &mut doubts);
+    let (lines, benches) = lines::arrange(benches, &options.params, &mut doubts);
     let doubts = close(doubts, &benches);
     let camera_sigma_m = cameras.map_or_else(Vec::new, |cameras| cameras.sigma_m);
     Some(Fused { lines, benches, doubts, camera_sigma_m })

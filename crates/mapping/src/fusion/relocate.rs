@@ -10,16 +10,9 @@ use super::{FusionParams, LocatedPiece, View};
 use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 
-/// Relative difference up to which a piece may be of a type by its depth from the cloud.
-const MOST_OFF: f64 = 0.15;
-/// Rounds of the robust fit of one piece.
-const ROUNDS: usize = 4;
-/// Boxes looked at to measure how well they are centred.
-const SAMPLED_PIECES: usize = 4000;
-
 /// Puts every piece of a known type where its boxes and its pitch say.
 pub(super) fn relocate(views: &[View<'_>], pieces: &mut [LocatedPiece], types: &[BenchType], params: &FusionParams) {
-    let stride = pieces.len().div_ceil(SAMPLED_PIECES).max(1);
+    let stride = pieces.len().div_ceil(params.most_sampled_pieces).max(1);
     let residuals: Vec<f64> = pieces
         .par_iter()
         .step_by(stride)
@@ -92,14 +85,14 @@ fn fit(
     };
     let (index, kind) = types.iter().enumerate().min_by(|p, q| off(p.1).total_cmp(&off(q.1)))?;
     let pitch = kind.pitch_m[0]?;
-    if (pitch / length).ln().abs() > MOST_OFF {
+    if (pitch / length).ln().abs() > params.type_most_off {
         return None;
     }
     let mut lattice = start(&by_cloud, pitch / length, kind, piece.rows, &shot.pose.center());
     let depth_m = shot.pose.to_camera(&by_cloud.position(0.0, 0.0)).z;
     let shared_m = params.shared_sigma_px * depth_m / shot.camera.focal_px();
     let mut covariance = None;
-    for _ in 0..ROUNDS {
+    for _ in 0..params.fit_rounds {
         let mut normal = normal_of(piece, shot, Some(&lattice), box_sigma_px, params.shared_sigma_px);
         add_knowledge(&mut normal, &lattice, &by_cloud, kind, piece, params);
         let (solved, of_it, _) = normal.solve()?;

@@ -16,9 +16,6 @@ struct Crossing {
     by_sides: f64,
 }
 
-/// From so many pairs on, the sides of their boxes tell how far apart they stand: the sides of one box err more than its centre.
-pub(super) const MANY_CROSSINGS: usize = 4;
-
 /// Removes the links over bench gaps. The distance of neighbours is compared with a smooth model of the pitch in this
 /// component; all rows that cross between the same two columns decide together.
 pub(super) fn cut_gaps(
@@ -82,7 +79,7 @@ pub(super) fn cut_gaps(
             let group = &links_here[start..end];
             let wide = median(&mut group.iter().map(|link| link.by_pitch).collect::<Vec<_>>());
             let mut gap = wide > options.gap_threshold;
-            if group.len() >= MANY_CROSSINGS {
+            if group.len() >= options.params.many_crossings {
                 // Where tables lean away from each other no pitch is common to both; their modules' own sides tell.
                 gap |= median(&mut group.iter().map(|link| link.by_sides).collect::<Vec<_>>()) > options.gap_threshold;
             }
@@ -94,7 +91,7 @@ pub(super) fn cut_gaps(
                 let usual: Vec<(Quad, Quad)> =
                     links_here.iter().filter(|link| link.by_pitch.abs() < 0.03).take(40).map(quads).collect();
                 let here: Vec<(Quad, Quad)> = group.iter().map(quads).collect();
-                gap = transition::is_gap(grey, &here, &usual);
+                gap = transition::is_gap(grey, &here, &usual, &options.params);
             }
             if gap {
                 for (i, j) in group.iter().map(|link| link.nodes) {

@@ -4,19 +4,12 @@
 use super::cut::cut_gaps;
 use super::join::join;
 use super::lattice::{LatticeMap, Sample};
-use super::{Cell, End, LayoutOptions, Piece};
+use super::{Cell, End, LayoutOptions, LayoutParams, Piece};
 use crate::detection::ImageDetections;
 use crate::geometry::Quad;
 use image::GrayImage;
 use nalgebra::Vector2;
 use std::collections::{BTreeMap, HashMap, VecDeque};
-
-/// A module's neighbours stand 0.75 to this many of its own sides away; what is further is no neighbour.
-const REACH: f64 = 1.45;
-/// Share of the shorter pitch that a module may stand off its lattice (the paper's RANSAC threshold).
-const INLIER: f64 = 0.25;
-/// So many modules in a row are a row by themselves, whatever stands about.
-const LONG: i32 = 12;
 
 /// A detection as the growth sees it: its centre, and the side vectors of its box, `b` a quarter turn clockwise from `a`.
 #[derive(Clone, Copy)]
@@ -97,20 +90,20 @@ pub(super) fn grow(
         .iter()
         .map(|detection| Node { center: detection.quad.center(), sides: detection.quad.sides() })
         .collect();
-    let mut links = find_links(&nodes);
+    let mut links = find_links(&nodes, &options.params);
     let loose_components = components(&nodes, &links);
     for component in &loose_components {
         cut_gaps(component, &nodes, &mut links, detections, grey, options);
     }
     let mut grown: Vec<Component> = components(&nodes, &links);
     for component in &mut grown {
-        drop_outliers(component, &nodes);
+        drop_outliers(component, &nodes, &options.params);
     }
     // What is joined is judged along the row, so the row must be known first; what was joined may tell more of it.
-    orient(&mut grown, &nodes);
+    orient(&mut grown, &nodes, options.params.long_columns);
     join(&mut grown, &nodes, detections, grey, options);
     grown.retain(|component| component.places.len() >= 2);
-    orient(&mut grown, &nodes);
+    orient(&mut grown, &nodes, options.params.long_columns);
     let mut used = vec![false; nodes.len()];
     let mut pieces: Vec<Piece> = grown
         .iter()
@@ -118,23 +111,22 @@ pub(super) fn grow(
             for node in component.places.values() {
                 used[*node] = true;
             }
-            piece(component, &nodes, detections)
+            piece(component, &nodes, detections, &options.params)
         })
         .collect();
-    open_torn_ends(&mut pieces);
+    open_torn_ends(&mut pieces, &options.params);
     let loose = (0..nodes.len()).filter(|node| !used[*node]).collect();
     (pieces, loose)
 }
 
 /// Where another piece stands on the lattice of this one, a few whole columns further on, neither is sure to end: modules
 /// may be missed between them as well as a gap may happen to be as wide.
-fn open_torn_ends(pieces: &mut [Piece]) {
-    /// Further off no lattice is known well enough, columns.
-    const NEAR: f64 = 9.0;
+fn open_torn_ends(pieces: &mut [Piece], params: &LayoutParams) {
+    let near = params.torn_reach;
     let mut open: Vec<(usize, bool)> = Vec::new();
     for (i, base) in pieces.iter().enumerate() {
         let [u, v] = base.map.pitch(f64::from(base.cols - 1) / 2.0, f64::from(base.rows - 1) / 2.0);
-        let reach_px = u.norm() * (f64::from(base.cols) / 2.0 + NEAR) + v.norm() * f64::from(base.rows);
+        let reach_px = u.norm() * (f64::from(base.cols) / 2.0 + near) + v.norm() * f64::from(base.rows);
         let middle = base.map.pixel(f64::from(base.cols - 1) / 2.0, f64::from(base.rows - 1) / 2.0);
         for (j, part) in pieces.iter().enumerate() {
             if i == j || base.cells.len() < part.cells.len() {
@@ -154,8 +146,8 @@ fn open_torn_ends(pieces: &mut [Piece]) {
                     let Some(at) = base.map.coordinate(center) else { return false };
                     let beyond = if west_end { at.x - f64::from(base.cols - 1) } else { -at.x };
                     let off = Vector2::new((at.x - at.x.round()) * u.norm(), (at.y - at.y.round()) * v.norm());
-                    let allowed = (0.12 + 0.02 * beyond) * u.norm().min(v.norm());
-                    (0.5..NEAR).contains(&beyond)
+                    let allowed = (params.torn_off + params.torn_off_per_column * beyond) * u.norm().min(v.norm());
+                    (0.5..near).contains(&beyond)
                         && (-0.5..f64::from(base.rows) - 0.5).contains(&at.y)
                         && off.x.abs() < allowed
                         && off.y.abs() < allowed
@@ -178,12 +170,12 @@ fn open_torn_ends(pieces: &mut [Piece]) {
 }
 
 /// The mutual nearest neighbours of every module in its four directions.
-fn find_links(nodes: &[Node]) -> Vec<[Link; 4]> {
+fn find_links(nodes: &[Node], params: &LayoutParams) -> Vec<[Link; 4]> {
     let mut longest: Vec<f64> = nodes.iter().map(|node| node.sides[0].norm().max(node.sides[1].norm())).collect();
     if longest.is_empty() {
         return Vec::new();
     }
-    let cell_px = (median(&mut longest) * REACH).max(1.0);
+    let cell_px = (median(&mut longest) * params.neighbour_sides[1]).max(1.0);
     let key = |p: Vector2<f64>| ((p.x / cell_px).floor() as i64, (p.y / cell_px).floor() as i64);
     let mut grid: HashMap<(i64, i64), Vec<usize>> = HashMap::new();
     for (index, node) in nodes.iter().enumerate() {
@@ -201,7 +193,7 @@ fn find_links(nodes: &[Node]) -> Vec<[Link; 4]> {
                         if i == j {
                             continue;
                         }
-                        let Some((d, turn, distance)) = neighbour(node, &nodes[j]) else { continue };
+                        let Some((d, turn, distance)) = neighbour(node, &nodes[j], params) else { continue };
                         if distance < best[d].0 {
                             best[d] = (distance, Some((j, turn)));
                         }
@@ -222,7 +214,8 @@ fn find_links(nodes: &[Node]) -> Vec<[Link; 4]> {
 }
 
 /// In which direction of `node` the other one is its neighbour, the quarter turns between their frames, and the distance.
-fn neighbour(node: &Node, other: &Node) -> Option<(usize, usize, f64)> {
+fn neighbour(node: &Node, other: &Node, params: &LayoutParams) -> Option<(usize, usize, f64)> {
+    let ([low, high], [nearest, furthest]) = (params.neighbour_ratio, params.neighbour_sides);
     let turn = (0..4).max_by(|&s, &t| {
         let cosine = |k: usize| node.sides[0].dot(&other.direction(k)) / other.direction(k).norm();
         cosine(s).total_cmp(&cosine(t))
@@ -230,7 +223,7 @@ fn neighbour(node: &Node, other: &Node) -> Option<(usize, usize, f64)> {
     let (a, b) = ((node.sides[0] + other.direction(turn)) / 2.0, (node.sides[1] + other.direction(turn + 1)) / 2.0);
     for (mine, theirs) in [(node.sides[0], other.direction(turn)), (node.sides[1], other.direction(turn + 1))] {
         let ratio = theirs.norm() / mine.norm();
-        if !(0.65..1.55).contains(&ratio) || mine.dot(&theirs) < 0.85 * mine.norm() * theirs.norm() {
+        if !(low..high).contains(&ratio) || mine.dot(&theirs) < params.neighbour_cosine * mine.norm() * theirs.norm() {
             return None;
         }
     }
@@ -240,7 +233,7 @@ fn neighbour(node: &Node, other: &Node) -> Option<(usize, usize, f64)> {
         return None;
     }
     let (along_a, along_b) = (offset.perp(&b) / determinant, a.perp(&offset) / determinant);
-    let near = |main: f64, side: f64| (0.75..REACH).contains(&main.abs()) && side.abs() < 0.35;
+    let near = |main: f64, side: f64| (nearest..furthest).contains(&main.abs()) && side.abs() < params.neighbour_aside;
     let d = if near(along_a, along_b) {
         if along_a > 0.0 { 0 } else { 2 }
     } else if near(along_b, along_a) {
@@ -289,8 +282,8 @@ fn components(nodes: &[Node], links: &[[Link; 4]]) -> Vec<Component> {
 }
 
 /// Takes out modules that stand off the lattice of their component.
-fn drop_outliers(component: &mut Component, nodes: &[Node]) {
-    if component.places.len() < 6 {
+fn drop_outliers(component: &mut Component, nodes: &[Node], params: &LayoutParams) {
+    if component.places.len() < params.inlier_least {
         return;
     }
     let map = component.map(nodes);
@@ -300,7 +293,7 @@ fn drop_outliers(component: &mut Component, nodes: &[Node]) {
         .filter(|((col, row), node)| {
             let [u, v] = map.pitch(f64::from(*col), f64::from(*row));
             (map.pixel(f64::from(*col), f64::from(*row)) - nodes[**node].center).norm()
-                > INLIER * u.norm().min(v.norm())
+                > params.inlier * u.norm().min(v.norm())
         })
         .map(|(place, _)| *place)
         .collect();
@@ -311,7 +304,7 @@ fn drop_outliers(component: &mut Component, nodes: &[Node]) {
 
 /// Turns every component so that its columns run along the row: a long one by its own shape, a short one as the long ones
 /// about it and its shape say together. Columns then count to the right, rows downwards on the screen.
-fn orient(grown: &mut [Component], nodes: &[Node]) {
+fn orient(grown: &mut [Component], nodes: &[Node], long_columns: i32) {
     let extent = |component: &Component| {
         let (cols, rows) = (component.col_range(), component.row_range());
         (cols.1 - cols.0 + 1, rows.1 - rows.0 + 1)
@@ -340,7 +333,7 @@ fn orient(grown: &mut [Component], nodes: &[Node]) {
         let [u, v] = component.sides(nodes);
         let here = center(component);
         let clear = cols.max(rows) >= 2 * cols.min(rows) && cols.max(rows) >= 4;
-        let along_u = if clear && cols.max(rows) >= LONG {
+        let along_u = if clear && cols.max(rows) >= long_columns {
             cols >= rows
         } else {
             let size = u.norm().max(v.norm());
@@ -401,7 +394,7 @@ fn orient(grown: &mut [Component], nodes: &[Node]) {
 }
 
 /// The finished piece: coordinates from 0, hypotheses in the holes, and what bounds it.
-fn piece(component: &Component, nodes: &[Node], detections: &ImageDetections) -> Piece {
+fn piece(component: &Component, nodes: &[Node], detections: &ImageDetections, params: &LayoutParams) -> Piece {
     let (col_low, col_high) = component.col_range();
     let (row_low, row_high) = component.row_range();
     let (cols, rows) = (col_high - col_low + 1, row_high - row_low + 1);
@@ -418,7 +411,7 @@ fn piece(component: &Component, nodes: &[Node], detections: &ImageDetections) ->
         let [du, dv] = map.pitch(c, r);
         Quad::from_center(map.pixel(c, r), du * fill_u / 2.0, dv * fill_v / 2.0)
     };
-    let margin = (0.15 * u.norm().min(v.norm())).max(4.0);
+    let margin = (params.frame_margin * u.norm().min(v.norm())).max(params.frame_margin_px);
     let (width, height) = (f64::from(detections.width_px), f64::from(detections.height_px));
     let inside = |quad: &Quad| {
         quad.corners

@@ -1,17 +1,14 @@
 //! Parts that stand in one lattice become one: what a broken link or missing modules (paper, equation 3) tore apart.
 
-use super::cut::MANY_CROSSINGS;
 use super::grow::{Component, Node, median, range};
 use super::lattice::LatticeMap;
-use super::{LayoutOptions, transition};
+use super::{LayoutOptions, LayoutParams, transition};
 use crate::detection::ImageDetections;
 use crate::geometry::Quad;
 use image::GrayImage;
 use nalgebra::Vector2;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// How much wider than the narrowest gap must be what keeps two parts of one lattice apart.
-const SURE_GAP: f64 = 1.2;
 /// Joins components that stand in one lattice: what a broken link or missing modules (equation 3) tore apart.
 pub(super) fn join(
     grown: &mut Vec<Component>,
@@ -32,7 +29,8 @@ pub(super) fn join(
         while other < grown.len() {
             let (base, part) = ((&grown[index], sides[index]), (&grown[other], sides[other]));
             let joined = attachment(base, &map, part, nodes, options).filter(|join| {
-                join.missing == 0 || bridge_is_sound(join, &grown[index], &map, grey, detections, nodes)
+                join.missing == 0
+                    || bridge_is_sound(join, (&grown[index], &map), grey, detections, nodes, &options.params)
             });
             let Some(attach) = joined else {
                 other += 1;
@@ -87,14 +85,16 @@ fn attachment(
     nodes: &[Node],
     options: &LayoutOptions,
 ) -> Option<Attachment> {
+    let params = &options.params;
     let directions = [part_sides[0], part_sides[1], -part_sides[0], -part_sides[1]];
     let turn = (0..4).max_by(|&s, &t| {
         let cosine = |k: usize| base_sides[0].dot(&directions[k]) / directions[k].norm();
         cosine(s).total_cmp(&cosine(t))
     })?;
     for (mine, theirs) in [(base_sides[0], directions[turn]), (base_sides[1], directions[(turn + 1) % 4])] {
-        if !(0.8..1.25).contains(&(theirs.norm() / mine.norm()))
-            || mine.dot(&theirs) < 0.95 * mine.norm() * theirs.norm()
+        let [low, high] = params.part_ratio;
+        if !(low..high).contains(&(theirs.norm() / mine.norm()))
+            || mine.dot(&theirs) < params.part_cosine * mine.norm() * theirs.norm()
         {
             return None;
         }
@@ -109,7 +109,7 @@ fn attachment(
         let at = map.coordinate(nodes[*node].center)?;
         let outside = (f64::from(col_low) - at.x).max(at.x - f64::from(col_high)).max(0.0);
         // The lattice is known where it was fitted; beyond it, less and less.
-        let tolerance = 0.15 + 0.02 * outside.min(10.0);
+        let tolerance = params.part_off + params.part_off_per_column * outside.min(10.0);
         let (u, v) = turned(*col, *row, turn);
         let near = (at.x.round() as i32 - u, at.y.round() as i32 - v);
         if shift.is_none() && outside > reach {
@@ -121,7 +121,7 @@ fn attachment(
             return None;
         }
         let (off_col, off_row) = (at.x - f64::from(place.0), at.y - f64::from(place.1));
-        if outside < reach && (off_col.abs() > tolerance * narrow || off_row.abs() > 0.25) {
+        if outside < reach && (off_col.abs() > tolerance * narrow || off_row.abs() > params.part_off_row) {
             return None;
         }
     }
@@ -162,10 +162,11 @@ fn attachment(
     ] {
         // The pitch in between is neither of both where tables lean away from each other.
         let leaning = (1.0 + directions[(turn + axis) % 4].norm() / base_sides[axis].norm()) / 2.0;
-        let excess = ends.and_then(|ends| excess(base, &placed, map, nodes, (axis, leaning), ends));
-        if excess
-            .is_some_and(|excess| excess.abs() > SURE_GAP * options.gap_threshold * shorter / base_sides[axis].norm())
-        {
+        let excess =
+            ends.and_then(|ends| excess(base, &placed, map, nodes, (axis, leaning), ends, params.many_crossings));
+        if excess.is_some_and(|excess| {
+            excess.abs() > params.sure_gap * options.gap_threshold * shorter / base_sides[axis].norm()
+        }) {
             return None;
         }
     }
@@ -193,6 +194,7 @@ fn excess(
     nodes: &[Node],
     (axis, leaning): (usize, f64),
     (end, start): (i32, i32),
+    many_crossings: usize,
 ) -> Option<f64> {
     let outwards = (start - end).signum();
     let mut found: Vec<f64> = Vec::new();
@@ -213,7 +215,7 @@ fn excess(
         }
     }
     // Rows are few, and those of one bench in line; columns are many.
-    let least = if axis == 0 { 2 } else { MANY_CROSSINGS };
+    let least = if axis == 0 { 2 } else { many_crossings };
     (facing.len() >= least).then(|| median(&mut found))
 }
 
@@ -221,11 +223,11 @@ fn excess(
 /// an image, the place must look like a module or be washed out by glare; without one, a single row may miss one or two.
 fn bridge_is_sound(
     attach: &Attachment,
-    base: &Component,
-    map: &LatticeMap,
+    (base, map): (&Component, &LatticeMap),
     grey: Option<&GrayImage>,
     detections: &ImageDetections,
     nodes: &[Node],
+    params: &LayoutParams,
 ) -> bool {
     let (row_low, row_high) = base.row_range();
     let Some(grey) = grey else {
@@ -237,5 +239,5 @@ fn bridge_is_sound(
         .flat_map(|k| (row_low..=row_high).map(move |row| (attach.bridge + k, row)))
         .map(|(col, row)| Quad::from_center(map.pixel(f64::from(col), f64::from(row)), u / 2.0, v / 2.0))
         .collect();
-    transition::looks_like_modules(grey, &places, &examples)
+    transition::looks_like_modules(grey, &places, &examples, params)
 }

@@ -4,10 +4,6 @@ use super::{Gap, LayoutOptions, Piece, transition};
 use crate::geometry::Quad;
 use image::GrayImage;
 
-/// How far apart, in pitches along the row, the facing modules of two benches may stand for a gap to be a keypoint. The
-/// paper stops below two (equation 2); wider ones are roads and still tie a line together.
-const WIDEST: f64 = 8.0;
-
 /// The gaps between the pieces of one image, one for each row that both benches have, sorted by piece and row.
 pub(super) fn find(pieces: &[Piece], grey: Option<&GrayImage>, options: &LayoutOptions) -> Vec<Gap> {
     let mut gaps = Vec::new();
@@ -25,7 +21,7 @@ pub(super) fn find(pieces: &[Piece], grey: Option<&GrayImage>, options: &LayoutO
                     continue;
                 }
                 let Some((to, pitches)) = facing(west, from.row, from.col, east) else { continue };
-                if pitches <= 1.0 + options.gap_threshold * 0.5 || pitches > WIDEST {
+                if pitches <= 1.0 + options.gap_threshold * 0.5 || pitches > options.params.widest_gap {
                     continue;
                 }
                 if nearest.as_ref().is_none_or(|gap| pitches < gap.pitches) {

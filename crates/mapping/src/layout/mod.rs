@@ -10,6 +10,7 @@ pub mod grow;
 mod join;
 pub mod keypoints;
 pub mod lattice;
+mod params;
 pub mod transition;
 
 use crate::detection::ImageDetections;
@@ -17,6 +18,7 @@ use crate::geometry::Quad;
 use image::GrayImage;
 pub use lattice::LatticeMap;
 use nalgebra::Vector2;
+pub use params::LayoutParams;
 use serde::{Deserialize, Serialize};
 
 /// What the inference may be told.
@@ -27,11 +29,12 @@ pub struct LayoutOptions {
     pub gap_threshold: f64,
     /// Most modules missing in a run that are taken for missed detections (equation 3).
     pub max_missing: i32,
+    pub params: LayoutParams,
 }
 
 impl Default for LayoutOptions {
     fn default() -> Self {
-        Self { gap_threshold: 0.1, max_missing: 8 }
+        Self { gap_threshold: 0.1, max_missing: 8, params: LayoutParams::default() }
     }
 }
 
@@ -110,6 +113,34 @@ pub struct Layout {
     pub gaps: Vec<Gap>,
     /// Detections that belong to no piece.
     pub loose: Vec<usize>,
+    /// Whether some of the benches in the image were left out: then its silence on a bench says nothing.
+    #[serde(default)]
+    pub partial: bool,
+}
+
+impl Layout {
+    /// Leaves out all pieces but those marked, and the gaps beside them.
+    pub fn keep_pieces(&mut self, kept: &[bool]) {
+        let mut next = 0;
+        let number: Vec<Option<usize>> = kept
+            .iter()
+            .map(|keep| {
+                let own = keep.then_some(next);
+                next += usize::from(*keep);
+                own
+            })
+            .collect();
+        let mut keep = kept.iter();
+        self.pieces.retain(|_| keep.next().copied().unwrap_or(false));
+        self.gaps.retain_mut(|gap| match (number[gap.west.0], number[gap.east.0]) {
+            (Some(west), Some(east)) => {
+                (gap.west.0, gap.east.0) = (west, east);
+                true
+            }
+            _ => false,
+        });
+        self.partial = true;
+    }
 }
 
 /// Infers the structure of one image. `grey` is the undistorted image, used to look at the ground between modules;
@@ -129,6 +160,7 @@ pub fn infer(detections: &ImageDetections, grey: Option<&GrayImage>, options: &L
         pieces,
         gaps,
         loose,
+        partial: false,
     }
 }
 

@@ -1,5 +1,6 @@
 //! What lies between two neighbouring modules: image patches and their histograms (paper, 3.3 and Fig. 8).
 
+use super::LayoutParams;
 use crate::geometry::Quad;
 use image::GrayImage;
 use nalgebra::Vector2;
@@ -87,7 +88,7 @@ pub(super) fn darkness(grey: &GrayImage, here: &[(Quad, Quad)], usual: &[(Quad, 
 
 /// Whether what lies between the pairs `here` is ground rather than the seam that lies between the pairs `usual`: a
 /// significantly darker patch, or one of quite another histogram.
-pub(super) fn is_gap(grey: &GrayImage, here: &[(Quad, Quad)], usual: &[(Quad, Quad)]) -> bool {
+pub(super) fn is_gap(grey: &GrayImage, here: &[(Quad, Quad)], usual: &[(Quad, Quad)], params: &LayoutParams) -> bool {
     let values = |pairs: &[(Quad, Quad)]| -> Vec<f64> {
         pairs.iter().flat_map(|(west, east)| strip(grey, west, east)).collect()
     };
@@ -97,11 +98,11 @@ pub(super) fn is_gap(grey: &GrayImage, here: &[(Quad, Quad)], usual: &[(Quad, Qu
     }
     let alike = similarity(&histogram(&here_values), &histogram(&usual_values));
     let darker = mean(&usual_values) - mean(&here_values);
-    (darker > 0.08 && alike < 0.6) || alike < 0.25
+    (darker > params.ground_darker && alike < params.ground_alike) || alike < params.ground_unlike
 }
 
 /// Whether the places look like the examples of modules, or are washed out by glare.
-pub(super) fn looks_like_modules(grey: &GrayImage, places: &[Quad], examples: &[Quad]) -> bool {
+pub(super) fn looks_like_modules(grey: &GrayImage, places: &[Quad], examples: &[Quad], params: &LayoutParams) -> bool {
     let inside = |quad: &Quad| -> Vec<f64> {
         let (center, [u, v]) = (quad.center(), quad.sides());
         let mut values = Vec::with_capacity(81);
@@ -124,8 +125,8 @@ pub(super) fn looks_like_modules(grey: &GrayImage, places: &[Quad], examples: &[
         if values.is_empty() {
             return true;
         }
-        let glare = values.iter().filter(|value| **value > 0.93).count() * 3 > values.len();
-        glare || similarity(&histogram(&values), &reference) > 0.5
+        let glare = values.iter().filter(|value| **value > params.glare).count() * 3 > values.len();
+        glare || similarity(&histogram(&values), &reference) > params.module_alike
     })
 }
 
@@ -152,8 +153,8 @@ mod tests {
         let grey = picture();
         let usual = [(module(11.5), module(37.5)), (module(37.5), module(63.5))];
         let gap = [(module(89.0), module(116.0))];
-        assert!(is_gap(&grey, &gap, &usual));
-        assert!(!is_gap(&grey, &usual[..1], &usual[1..]));
+        assert!(is_gap(&grey, &gap, &usual, &LayoutParams::default()));
+        assert!(!is_gap(&grey, &usual[..1], &usual[1..], &LayoutParams::default()));
         assert!(darkness(&grey, &gap, &usual).unwrap() > 0.2);
     }
 
@@ -166,8 +167,8 @@ mod tests {
             }
         }
         let examples = [module(20.0), module(50.0)];
-        assert!(looks_like_modules(&grey, &[module(64.0)], &examples));
-        assert!(looks_like_modules(&grey, &[module(170.0)], &examples));
-        assert!(!looks_like_modules(&grey, &[module(110.0)], &examples));
+        assert!(looks_like_modules(&grey, &[module(64.0)], &examples, &LayoutParams::default()));
+        assert!(looks_like_modules(&grey, &[module(170.0)], &examples, &LayoutParams::default()));
+        assert!(!looks_like_modules(&grey, &[module(110.0)], &examples, &LayoutParams::default()));
     }
 }

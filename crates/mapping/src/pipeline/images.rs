@@ -1,5 +1,6 @@
 //! Which images are searched, and the boxes in them: from a detector, a checkpoint, another worker, or a file.
 
+use super::coverage::{Coverage, CoverageParams};
 use super::progress::Clock;
 use super::search::{self, ImageRequest, Loaded};
 use super::{Found, MapError, MapOptions, NextImage, Observer, Stage};
@@ -11,7 +12,7 @@ use crate::reconstruction::{Photo, Project, ProjectFolder, Shot};
 use heliomap_model::Warning;
 use nalgebra::Vector3;
 use rayon::prelude::*;
-use std::collections::{HashMap, HashSet};
+use std::collections::{BTreeSet, HashMap, HashSet};
 use std::path::Path;
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -51,13 +52,8 @@ pub(super) fn ground_sampling_distances(shots: &[Shot], cloud: &PointCloud) -> V
 }
 
 /// Indices of the shots whose images resolve modules. The others helped the reconstruction (the paper's supplementary
-/// images) and are left out, with a note.
-pub(super) fn resolving(
-    project: &Project,
-    gsd_m: &[Option<f64>],
-    options: &MapOptions,
-    warnings: &mut Vec<Warning>,
-) -> Vec<usize> {
+/// images) and are left out, but where they alone show something.
+pub(super) fn resolving(gsd_m: &[Option<f64>], options: &MapOptions, warnings: &mut Vec<Warning>) -> Vec<usize> {
     let mut limit = options.max_gsd_m_per_px.unwrap_or(DEFAULT_MAX_GSD_M);
     let resolves =
         |limit: f64| -> Vec<usize> { (0..gsd_m.len()).filter(|k| gsd_m[*k].is_none_or(|gsd| gsd <= limit)).collect() };
@@ -76,25 +72,83 @@ pub(super) fn resolving(
             [],
         ));
     }
-    let shots = &project.reconstruction.shots;
-    let left_out: Vec<usize> = (0..shots.len()).filter(|k| gsd_m[*k].is_some_and(|gsd| gsd > limit)).collect();
-    if !left_out.is_empty() {
-        let coarsest = left_out.iter().filter_map(|k| gsd_m[*k]).fold(0.0, f64::max);
-        warnings.push(Warning::new(
-            "images_supplementary",
-            format!(
-                "{} of {} images are too coarse to resolve modules (up to {coarsest:.3} m per pixel, limit {limit:.3}): \
-                 they served the reconstruction and are not searched",
-                left_out.len(),
-                shots.len()
-            ),
-            left_out.iter().map(|k| shots[*k].name.clone()),
-        ));
-    }
     chosen
 }
 
+/// What is searched, and by what.
+pub(super) struct Search<'a> {
+    pub(super) folder: &'a dyn ProjectFolder,
+    pub(super) project: &'a Project,
+    pub(super) gsd_m: &'a [Option<f64>],
+    pub(super) detector: &'a dyn Detector,
+    pub(super) options: &'a MapOptions,
+}
+
+/// Searches the images that resolve modules, and coarser ones for what these alone show.
+pub(super) fn search_all(
+    search: &Search<'_>,
+    cloud: &PointCloud,
+    clock: &mut Clock<'_>,
+    warnings: &mut Vec<Warning>,
+) -> Result<Vec<Seen>, MapError> {
+    let Search { project, gsd_m, options, .. } = *search;
+    let chosen = resolving(gsd_m, options, warnings);
+    let shots = &project.reconstruction.shots;
+    let mut seen = search_images(search, &chosen, Vec::new(), clock)?;
+    let fine: BTreeSet<usize> = chosen.iter().copied().collect();
+    // Where the limit is given it holds.
+    if options.max_gsd_m_per_px.is_none() && chosen.len() < shots.len() {
+        let coverage = Coverage::new(shots, gsd_m, cloud, CoverageParams::default());
+        for _ in 0..coverage.params().most_rounds {
+            let coarser = coverage.missing(&seen);
+            if coarser.is_empty() {
+                break;
+            }
+            seen = search_images(search, &coarser, seen, clock)?;
+            for image in seen.iter_mut().filter(|image| coarser.contains(&image.shot)) {
+                coverage.keep_lacking(image, &fine);
+            }
+        }
+    }
+    clock.observer.progress(Stage::Layout, seen.len(), seen.len());
+    let coarser: Vec<usize> = seen.iter().map(|image| image.shot).filter(|shot| !fine.contains(shot)).collect();
+    warnings.extend(coarser_used(shots, gsd_m, &coarser));
+    let left_out: Vec<usize> =
+        (0..shots.len()).filter(|shot| !fine.contains(shot) && !coarser.contains(shot)).collect();
+    warnings.extend(supplementary(shots, gsd_m, &left_out));
+    Ok(seen)
+}
+
+/// The images that were searched for what they alone show.
+fn coarser_used(shots: &[Shot], gsd_m: &[Option<f64>], coarser: &[usize]) -> Option<Warning> {
+    let coarsest = coarser
+        .iter()
+        .filter_map(|shot| gsd_m[*shot])
+        .fold(None, |most: Option<f64>, gsd| Some(most.map_or(gsd, |most| most.max(gsd))))?;
+    let message = format!(
+        "{} images of up to {coarsest:.3} m per pixel were searched for benches that no finer image shows: modules there are \
+         less sure",
+        coarser.len()
+    );
+    Some(Warning::new("images_coarse", message, coarser.iter().map(|shot| shots[*shot].name.clone())))
+}
+
+/// The images that were not searched.
+fn supplementary(shots: &[Shot], gsd_m: &[Option<f64>], left_out: &[usize]) -> Option<Warning> {
+    let coarsest = left_out.iter().filter_map(|shot| gsd_m[*shot]).fold(0.0, f64::max);
+    (!left_out.is_empty()).then(|| {
+        let message = format!(
+            "{} of {} images are too coarse to resolve modules (up to {coarsest:.3} m per pixel): they served the \
+             reconstruction and are not searched",
+            left_out.len(),
+            shots.len()
+        );
+        Warning::new("images_supplementary", message, left_out.iter().map(|shot| shots[*shot].name.clone()))
+    })
+}
+
 /// An image that was searched.
+#[derive(Clone)]
 pub(super) struct Seen {
     pub(super) shot: usize,
     pub(super) detections: ImageDetections,
@@ -107,20 +161,21 @@ impl Seen {
     }
 }
 
-/// Detects and lays out image by image, those apart that an earlier run or others have searched.
-pub(super) fn search(
-    folder: &dyn ProjectFolder,
-    project: &Project,
+/// Detects and lays out image by image, those apart that an earlier run or others have searched; `seen` are those that were
+/// before.
+fn search_images(
+    search: &Search<'_>,
     chosen: &[usize],
-    gsd_m: &[Option<f64>],
-    detector: &dyn Detector,
-    max_pixels: u64,
+    mut seen: Vec<Seen>,
     clock: &mut Clock<'_>,
 ) -> Result<Vec<Seen>, MapError> {
+    let Search { folder, project, gsd_m, detector, options } = *search;
+    let max_pixels = options.max_image_pixels;
     let observer = clock.observer;
     let start = Instant::now();
-    let total = chosen.len();
-    let (seen, shots): (Vec<Seen>, Vec<usize>) = from_checkpoints(project, chosen, observer);
+    let total = seen.len() + chosen.len();
+    let (known, shots): (Vec<Seen>, Vec<usize>) = from_checkpoints(project, chosen, observer);
+    seen.extend(known);
     observer.progress(Stage::Detect, seen.len(), total);
     let requests: Vec<ImageRequest> = shots
         .iter()
@@ -153,7 +208,9 @@ pub(super) fn search(
                 return Some(pixels.map(|pixels| Loaded { key: image, image: name, pixels, gsd_m: gsd_m[shot] }));
             }
             // What was found twice counts once.
-            NextImage::Found(image, found) if left.contains(&image) => {
+            NextImage::Found(image, found)
+                if left.contains(&image) && found.detections.image == requests[image].image =>
+            {
                 left.retain(|other| *other != image);
                 keep(image, *found);
             }
@@ -171,7 +228,6 @@ pub(super) fn search(
     seen.sort_by_key(|image| image.shot);
     clock.add(Stage::Detect, start.elapsed().saturating_sub(layout_time));
     clock.add(Stage::Layout, layout_time);
-    observer.progress(Stage::Layout, total, total);
     Ok(seen)
 }
 
@@ -264,7 +320,7 @@ pub(super) fn from_boxes(
         warnings.push(Warning::new("boxes_double", message, images));
     }
     // What those notes say of a search does not hold here.
-    let expected = resolving(project, gsd_m, options, &mut Vec::new());
+    let expected = resolving(gsd_m, options, &mut Vec::new());
     let given: HashSet<usize> = seen.iter().map(|(shot, _)| *shot).collect();
     let without: Vec<String> = expected
         .into_iter()

@@ -10,40 +10,30 @@
 use super::lattice::{BenchMatrix, BenchVector, Lattice, PARAMS, centered, median};
 use super::normal::{Group, Normal, Sight, Spreads, Step};
 use super::spacing::{self, Spacing};
-use super::uncertainty::{self, Uncertainty};
+use super::uncertainty::{self, Measured, Uncertainty};
 use super::views::AdjustedView;
 use super::{Refined, RefinedBench, RefinedModule, RefinementParams};
 use crate::fusion::{Fused, FusedBench, View};
 use nalgebra::{Vector2, Vector3};
 use rayon::prelude::*;
 use std::cmp::Ordering;
-
-/// Standard deviation of a corner in units of that of a centre.
-const CORNER_SPREAD: f32 = 3.0;
-/// How well the cloud is taken to know the place of a bench before anything is known of it, and at best, metres: where
-/// views and cloud disagree the views are right.
-const FIRST_CLOUD_M: f64 = 2.0;
-const BEST_CLOUD_M: f64 = 0.2;
-/// How far from a right angle a table may be, as the cosine.
-const SQUARE_SIGMA: f64 = 0.003;
-/// How far a bench bends from straight over half its length, metres.
-const BEND_SIGMA_M: f64 = 0.1;
-/// How much the ground that one view shows may be displaced before anything is known of it, metres.
-const FIRST_POSE_M: f64 = 0.3;
-const MOST_ROUNDS: usize = 12;
-/// Steps end when nothing moves further than this any more, metres, and spreads change by no more than this share.
-const SETTLED_M: f64 = 5e-4;
-const SETTLED: f64 = 0.05;
-/// Residuals looked at to tell how well boxes are centred.
-const SAMPLED: usize = 200_000;
+use std::collections::BTreeMap;
 
 /// Refines all benches.
 pub(super) fn refine(views: &[View<'_>], fused: &Fused, params: &RefinementParams) -> Refined {
     let benches = &fused.benches;
     let mut problem = Problem::new(views, benches, &fused.camera_sigma_m, *params);
     problem.solve();
-    let uncertainties =
-        uncertainty::of_benches(&problem.linearised(), &problem.lattices, &problem.views, &problem.spreads);
+    let scatter = uncertainty::scatter(
+        (&problem.lattices, &problem.groups),
+        &problem.views,
+        &problem.spreads,
+        params,
+        |bench, normal, right| problem.prior(bench, normal, right),
+    );
+    let known = (problem.lattices.as_slice(), problem.views.as_slice());
+    let measured = Measured { scatter, common_m: problem.common_m() };
+    let uncertainties = uncertainty::of_benches(&problem.linearised(), known, &problem.spreads, &measured, params);
     let benches = benches
         .par_iter()
         .zip(problem.lattices.par_iter().zip(&uncertainties))
@@ -79,8 +69,11 @@ impl Problem {
     fn new(views: &[View<'_>], benches: &[FusedBench], camera_sigma_m: &[f64], params: RefinementParams) -> Self {
         let camera_m = median(camera_sigma_m.to_vec());
         let lattices: Vec<Lattice> = benches.par_iter().map(|bench| Lattice::start(views, bench)).collect();
-        let mut groups: Vec<Vec<Group>> =
-            benches.par_iter().zip(&lattices).map(|(bench, lattice)| groups_of(views, bench, lattice)).collect();
+        let mut groups: Vec<Vec<Group>> = benches
+            .par_iter()
+            .zip(&lattices)
+            .map(|(bench, lattice)| groups_of(views, bench, lattice, &params))
+            .collect();
         let mut groups_of_view: Vec<Vec<(usize, usize)>> = vec![Vec::new(); views.len()];
         for (bench, groups) in groups.iter().enumerate() {
             for (place, group) in groups.iter().enumerate() {
@@ -123,7 +116,7 @@ impl Problem {
                 Anchor { lattice: lattice.clone(), spread: [mean_square(|p| p.0), mean_square(|p| p.1)] }
             })
             .collect();
-        let spacings = spacing::types(benches, &lattices);
+        let spacings = spacing::types(benches, &lattices, &params);
         let mut problem = Self {
             lattices,
             groups,
@@ -132,10 +125,10 @@ impl Problem {
                 center_px: 1.0,
                 group_px: (median(offsets).unwrap_or(1.0) / 1.18).clamp(1.0, 60.0),
                 shared_px: if camera_m.is_some() { params.shared_px } else { 0.0 },
-                pose_m: if camera_m.is_some() { params.fixed_pose_m } else { FIRST_POSE_M },
+                pose_m: if camera_m.is_some() { params.fixed_pose_m } else { params.first_pose_m },
             },
             anchors,
-            cloud_m: FIRST_CLOUD_M,
+            cloud_m: params.first_cloud_m,
             spacings,
             camera_m,
             params,
@@ -155,7 +148,7 @@ impl Problem {
     fn solve(&mut self) {
         // Far from the solution a step need not be exact; where there are few views it costs nothing.
         let (tolerance, most) = if self.views.len() <= 500 { (1e-8, 1000) } else { (1e-3, 100) };
-        for round in 0..MOST_ROUNDS {
+        for round in 0..self.params.most_rounds {
             let normal = self.linearised();
             let step = normal.solve(tolerance, most);
             let moved_m = self.take(&step);
@@ -167,10 +160,10 @@ impl Problem {
                 pose_m: self.next_pose_m(round, &normal, before.pose_m),
             };
             self.cloud_m = self.cloud_spread_m();
-            spacing::update(&mut self.spacings, &self.lattices);
-            let settled = |new: f64, old: f64| (new / old - 1.0).abs() < SETTLED;
+            spacing::update(&mut self.spacings, &self.lattices, &self.params);
+            let settled = |new: f64, old: f64| (new / old - 1.0).abs() < self.params.settled;
             if round >= self.params.fixed_rounds.max(3) + usize::from(self.camera_m.is_some())
-                && moved_m < SETTLED_M
+                && moved_m < self.params.settled_m
                 && settled(self.spreads.center_px, before.center_px)
                 && settled(self.spreads.group_px, before.group_px)
                 && settled(self.spreads.pose_m, before.pose_m)
@@ -212,20 +205,20 @@ impl Problem {
             }
         }
         // A bench too short to show a bend has none.
-        let bend_sigma_m = if lattice.bends { BEND_SIGMA_M } else { 1e-6 };
+        let bend_sigma_m = if lattice.bends { self.params.bend_sigma_m } else { 1e-6 };
         let stiff = 1.0 / (bend_sigma_m * bend_sigma_m);
         for axis in 0..3 {
             normal[(9 + axis, 9 + axis)] += stiff;
             right[9 + axis] -= stiff * lattice.terms[3][axis];
         }
-        square_prior(lattice, normal, right);
-        self.spacings[bench].prior(lattice, normal, right);
+        square_prior(lattice, self.params.square_sigma, normal, right);
+        self.spacings[bench].prior(lattice, self.params.type_sigma, normal, right);
     }
 
     /// Standard deviation of a box's centre by the residuals, pixels.
     fn center_spread_px(&self) -> f64 {
         let count: usize = self.groups.iter().flatten().map(|group| group.sights.len()).sum();
-        let stride = count.div_ceil(SAMPLED).max(1);
+        let stride = count.div_ceil(self.params.most_sampled).max(1);
         let rest: Vec<f64> = self
             .groups
             .par_iter()
@@ -243,6 +236,38 @@ impl Problem {
             .collect();
         // Half of the lengths of a normal deviation in the plane are below 1.18 sigma.
         median(rest).map_or(0.5, |median| median / 1.1774).clamp(0.02, 10.0)
+    }
+
+    /// How far the boxes of one module are off alike in all views, one standard deviation on the ground, metres: what the means
+    /// of its residuals scatter more than boxes that err by themselves would.
+    fn common_m(&self) -> f64 {
+        let means: Vec<(f64, f64)> = self
+            .groups
+            .par_iter()
+            .zip(&self.lattices)
+            .flat_map_iter(|(groups, lattice)| {
+                let mut modules: BTreeMap<(i32, i32), (Vector2<f64>, f64, f64)> = BTreeMap::new();
+                for group in groups {
+                    let view = &self.views[group.view];
+                    let sigma_m = self.spreads.center_px / view.px_per_m();
+                    for (sight, (rest, spread)) in group.sights.iter().zip(residuals_px(lattice, group, &self.views)) {
+                        if spread <= 1.0 {
+                            let place = sight.place.map(|at| (2.0 * at).round() as i32);
+                            let entry = modules.entry((place[0], place[1])).or_default();
+                            entry.0 += view.on_ground(rest - group.offset_px);
+                            entry.1 += sigma_m * sigma_m;
+                            entry.2 += 1.0;
+                        }
+                    }
+                }
+                let several = modules.into_values().filter(|(_, _, count)| *count >= 3.0);
+                several.map(|(sum, squares, count)| ((sum / count).norm_squared(), squares / (count * count)))
+            })
+            .collect();
+        let (squares, expected): (Vec<f64>, Vec<f64>) = means.into_iter().unzip();
+        // Half of the squared lengths of a normal deviation in the plane are below 1.386 variances.
+        let square = median(squares).unwrap_or(0.0) / 1.386;
+        (square - median(expected).unwrap_or(0.0)).max(0.0).sqrt()
     }
 
     /// Standard deviation of the offsets of groups (MacKay's fixed point: the sum of squares over the number that the
@@ -270,7 +295,8 @@ impl Problem {
     fn cloud_spread_m(&self) -> f64 {
         let off = self.anchors.iter().zip(&self.lattices).zip(&self.groups).filter(|(_, groups)| groups.len() > 2);
         let off = off.map(|((anchor, lattice), _)| (anchor.lattice.terms[0] - lattice.terms[0]).norm()).collect();
-        median(off).map_or(FIRST_CLOUD_M, |off_m| 3.0 * off_m).clamp(BEST_CLOUD_M, FIRST_CLOUD_M)
+        let RefinementParams { first_cloud_m, best_cloud_m, .. } = self.params;
+        median(off).map_or(first_cloud_m, |off_m| 3.0 * off_m).clamp(best_cloud_m, first_cloud_m)
     }
 
     /// The same for the next round: where the cameras' quality is known they stand still at first, and never stray beyond it.
@@ -285,7 +311,7 @@ impl Problem {
 
     /// Standard deviation of the poses' errors as they move the ground, likewise.
     fn pose_spread_m(&self, normal: &Normal, before_m: f64) -> f64 {
-        let variances = uncertainty::pose_variances(normal, self.views.len());
+        let variances = uncertainty::pose_variances(normal, self.views.len(), self.params.exact_views);
         let (mut squares, mut determined) = (0.0, 0.0);
         for (view, variance) in self.views.iter().zip(variances) {
             let scale = view.prior_scale();
@@ -299,7 +325,8 @@ impl Problem {
 }
 
 /// The sights of a bench, by view.
-fn groups_of(views: &[View<'_>], bench: &FusedBench, lattice: &Lattice) -> Vec<Group> {
+fn groups_of(views: &[View<'_>], bench: &FusedBench, lattice: &Lattice, params: &RefinementParams) -> Vec<Group> {
+    let edge_spread = params.edge_spread as f32;
     let mut groups: Vec<Group> = Vec::new();
     let mut group_of_view = std::collections::BTreeMap::new();
     for module in &bench.modules {
@@ -327,8 +354,8 @@ fn groups_of(views: &[View<'_>], bench: &FusedBench, lattice: &Lattice) -> Vec<G
                 let toward = below - here;
                 let side = if toward.dot(&u).abs() / u.norm() > toward.dot(&v).abs() / v.norm() { u } else { v };
                 let half = if side.dot(&toward) > 0.0 { side / 2.0 } else { -side / 2.0 };
-                add(0.5, middle + half, CORNER_SPREAD);
-                add(-0.5, middle - half, CORNER_SPREAD);
+                add(0.5, middle + half, edge_spread);
+                add(-0.5, middle - half, edge_spread);
             }
         }
     }
@@ -349,14 +376,14 @@ fn residuals_px(lattice: &Lattice, group: &Group, views: &[AdjustedView]) -> Vec
 }
 
 /// Tables are square: a weak observation that the two steps are perpendicular.
-fn square_prior(lattice: &Lattice, normal: &mut BenchMatrix, right: &mut BenchVector) {
+fn square_prior(lattice: &Lattice, sigma: f64, normal: &mut BenchMatrix, right: &mut BenchVector) {
     let (u, v) = (lattice.step_col(), lattice.step_row());
     let lengths = u.norm() * v.norm();
     if lengths < 1e-9 {
         return;
     }
     let rest = -u.dot(&v) / lengths;
-    let weight = 1.0 / (SQUARE_SIGMA * SQUARE_SIGMA);
+    let weight = 1.0 / (sigma * sigma);
     let mut gradient = [0.0; 6];
     for a in 0..3 {
         gradient[a] = v[a] / lengths;

@@ -3,20 +3,18 @@
 //! Where cameras are good, every view alone knows the place of what it shows to a fraction of a module. The views that most
 //! others agree with are right; an adjustment of all together would look for a compromise instead.
 
+use super::RefinementParams;
 use super::verify::{Verdict, replace};
 use crate::fusion::FusedBench;
 use nalgebra::{Matrix2, Vector2};
 use std::collections::BTreeMap;
 
-/// Modules that two views must have in common to be compared.
-const LEAST_COMMON: usize = 3;
-
 /// Places of what each view shows, by row and column, metres east and north.
 type Shown = BTreeMap<usize, BTreeMap<(i32, i32), Vector2<f64>>>;
 
-/// Moves what views show of a bench to where most have it. `most_rest` is how far from a whole number of columns and rows a
-/// view may lie. Returns how many sightings moved.
-pub(super) fn agree(bench: &mut FusedBench, most_rest: f64) -> usize {
+/// Moves what views show of a bench to where most have it. Returns how many sightings moved.
+pub(super) fn agree(bench: &mut FusedBench, params: &RefinementParams) -> usize {
+    let most_rest = params.most_rest_pitches;
     let [u, v] = bench.pitch_m;
     let Some(steps) = Matrix2::from_columns(&[u, v]).try_inverse() else { return 0 };
     let mut shown = Shown::new();
@@ -30,7 +28,7 @@ pub(super) fn agree(bench: &mut FusedBench, most_rest: f64) -> usize {
     let mut off: BTreeMap<(usize, usize), Vector2<f64>> = BTreeMap::new();
     for &from in &views {
         for &to in &views {
-            if let Some(between) = median_off(&shown[&from], &shown[&to]).filter(|_| from != to) {
+            if let Some(between) = median_off(&shown[&from], &shown[&to], params.least_common).filter(|_| from != to) {
                 off.insert((from, to), between);
             }
         }
@@ -68,9 +66,10 @@ pub(super) fn agree(bench: &mut FusedBench, most_rest: f64) -> usize {
 fn median_off(
     from: &BTreeMap<(i32, i32), Vector2<f64>>,
     to: &BTreeMap<(i32, i32), Vector2<f64>>,
+    least_common: usize,
 ) -> Option<Vector2<f64>> {
     let common: Vec<Vector2<f64>> = to.iter().filter_map(|(place, at)| Some(at - from.get(place)?)).collect();
-    if common.len() < LEAST_COMMON {
+    if common.len() < least_common {
         return None;
     }
     let median = |axis: usize| super::lattice::median(common.iter().map(|off| off[axis]).collect());

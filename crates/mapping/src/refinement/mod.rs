@@ -1,11 +1,14 @@
 //! From what the views say of each module to regular benches in space (paper, 3.6).
 
 mod adjustment;
+mod adopt;
 pub mod alignment;
 mod consensus;
+mod exclusion;
 mod lattice;
 mod normal;
 mod paper;
+mod params;
 mod scale;
 mod spacing;
 mod uncertainty;
@@ -17,6 +20,7 @@ use crate::geometry::{Pose, Similarity};
 pub use alignment::{Control, ControlError};
 use heliomap_model::Alignment;
 use nalgebra::{Rotation3, Vector3};
+pub use params::RefinementParams;
 pub use scale::Scaled;
 use serde::{Deserialize, Serialize};
 pub use verify::refine_verified;
@@ -43,41 +47,6 @@ pub struct RefinementOptions {
     /// Seed of the paper's RANSAC.
     pub seed: u64,
     pub params: RefinementParams,
-}
-
-/// How far an adjustment may go.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct RefinementParams {
-    /// First rounds of the adjustment, in which cameras stand still, so that what does not fit loses its weight before any
-    /// camera can move to please it.
-    pub fixed_rounds: usize,
-    /// What the ground may be displaced by a camera in these rounds, one standard deviation, metres.
-    pub fixed_pose_m: f64,
-    /// How far the spread of the cameras' corrections may exceed their measured quality, as a factor: the measurement itself is
-    /// right to about a half.
-    pub most_pose_factor: f64,
-    /// Standard deviation of what the boxes of one view on one bench have in common besides an offset, pixels.
-    pub shared_px: f64,
-    /// Most times that what does not fit is matched anew and all is adjusted again.
-    pub most_verifications: usize,
-    /// How far from a module a sighting may lie that shows it, as a share of the pitch.
-    pub most_rest_pitches: f64,
-    /// Sightings of one view on one bench that must agree on another place to be moved there.
-    pub least_moved: usize,
-}
-
-impl Default for RefinementParams {
-    fn default() -> Self {
-        Self {
-            fixed_rounds: 3,
-            fixed_pose_m: 0.005,
-            most_pose_factor: 1.5,
-            shared_px: 0.3,
-            most_verifications: 4,
-            most_rest_pitches: 0.3,
-            least_moved: 3,
-        }
-    }
 }
 
 /// A module in space.

@@ -265,6 +265,18 @@ impl Normal {
     }
 }
 
+/// What some groups alone make of a bench, all views standing as they are: the change of its lattice, and its covariance.
+pub(super) fn bench_by(
+    lattice: &Lattice,
+    groups: &[Group],
+    views: &[AdjustedView],
+    spreads: &Spreads,
+    prior: impl Fn(&mut BenchMatrix, &mut BenchVector),
+) -> (BenchVector, BenchMatrix) {
+    let BenchTerms { solved, inverse, .. } = bench_terms(lattice, groups, views, spreads, prior);
+    (solved, inverse)
+}
+
 /// Linearises one bench and eliminates the offsets of its groups, then the bench itself.
 fn bench_terms(
     lattice: &Lattice,

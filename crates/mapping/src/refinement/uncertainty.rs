@@ -6,20 +6,20 @@
 //! how it is turned and what its scale is cannot be told from images (GNSS tells, and control points), so these seven are
 //! taken out: what is stated is how far a module may stand off relative to the plant around it.
 //!
+//! What boxes leave open is measured, too: the places of benches by half of their views and by the other half differ by as much
+//! as they are known. Boxes that err together, or less than was feared, show in that.
+//!
 //! Boxes err alike in all views, too: a detector sees the edge of a table otherwise than a seam, from wherever it looks.
-//! Of that residuals tell nothing. It is taken to be half as large as what differs from view to view.
+//! Residuals show of that what no lattice fits: the means over all views of one module scatter more than boxes that err by
+//! themselves would. What a lattice does fit is taken to be as large, and besides a share of what differs from view to view.
 
-use super::lattice::{BenchMatrix, Lattice, PARAMS};
-use super::normal::{Normal, Spreads};
+use super::RefinementParams;
+use super::lattice::{BenchMatrix, BenchVector, Lattice, PARAMS, median};
+use super::normal::{Group, Normal, Spreads, bench_by};
 use super::views::AdjustedView;
 use nalgebra::{DMatrix, Matrix6, Vector3, Vector6};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
-
-/// Most views in a window.
-const WINDOW: usize = 20;
-/// Up to this many views the variance of their corrections is taken exactly.
-const EXACT_VIEWS: usize = 60;
 
 /// How well a bench is known: covariances of its lattice (origin, steps, bend).
 pub(super) struct Uncertainty {
@@ -31,13 +31,61 @@ pub(super) struct Uncertainty {
     pub(super) shared_m: f64,
 }
 
+/// What residuals say of the errors of boxes.
+pub(super) struct Measured {
+    /// See [`scatter`].
+    pub(super) scatter: Vector3<f64>,
+    /// How far the boxes of one module are off alike in all views, one standard deviation on the ground, metres.
+    pub(super) common_m: f64,
+}
+
+/// How much benches are really off, in units of what their boxes say, east, north and up: how far their places by half of their
+/// views and by the other half differ. One where too few benches are seen by enough views.
+pub(super) fn scatter(
+    (lattices, groups): (&[Lattice], &[Vec<Group>]),
+    views: &[AdjustedView],
+    spreads: &Spreads,
+    params: &RefinementParams,
+    priors: impl Fn(usize, &mut BenchMatrix, &mut BenchVector) + Sync,
+) -> Vector3<f64> {
+    let differences: Vec<Vector3<f64>> = lattices
+        .par_iter()
+        .zip(groups)
+        .enumerate()
+        .filter(|(_, (_, groups))| groups.len() >= params.least_halved)
+        .map(|(index, (lattice, groups))| {
+            let [(one, of_one), (other, of_other)] = [0, 1].map(|half| {
+                let own: Vec<Group> = groups.iter().skip(half).step_by(2).cloned().collect();
+                bench_by(lattice, &own, views, spreads, |normal, right| priors(index, normal, right))
+            });
+            Vector3::from_fn(|axis, _| {
+                let variance: f64 = of_one[(axis, axis)] + of_other[(axis, axis)];
+                (one[axis] - other[axis]).abs() / variance.sqrt().max(1e-9)
+            })
+        })
+        .collect();
+    let measured = |axes: &[usize]| {
+        let values: Vec<f64> = axes.iter().flat_map(|axis| differences.iter().map(|d| d[*axis])).collect();
+        let count = values.len() as f64;
+        // Half of the sizes of normal deviations are below 0.6745 sigma.
+        let square = median(values).map_or(1.0, |middle| (middle / 0.6745).powi(2));
+        let prior = params.scatter_prior;
+        ((square * count + prior) / (count + prior)).sqrt()
+    };
+    let in_plane = measured(&[0, 1]);
+    Vector3::new(in_plane, in_plane, measured(&[2]))
+}
+
 /// How well each bench is known.
 pub(super) fn of_benches(
     normal: &Normal,
-    lattices: &[Lattice],
-    views: &[AdjustedView],
+    (lattices, views): (&[Lattice], &[AdjustedView]),
     spreads: &Spreads,
+    measured: &Measured,
+    params: &RefinementParams,
 ) -> Vec<Uncertainty> {
+    let scatter = measured.scatter;
+    let scaled = |boxes: &BenchMatrix| BenchMatrix::from_fn(|i, j| boxes[(i, j)] * scatter[i % 3] * scatter[j % 3]);
     let mut benches_of: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
     for bench in 0..lattices.len() {
         benches_of.entry(normal.main_view(bench)).or_default().push(bench);
@@ -45,14 +93,14 @@ pub(super) fn of_benches(
     let found: Vec<Vec<(usize, Uncertainty)>> = benches_of
         .into_par_iter()
         .map(|(main, benches)| {
-            let window = normal.window(main, WINDOW);
+            let window = normal.window(main, params.window_views);
             let middle = benches.iter().map(|bench| lattices[*bench].terms[0]).sum::<Vector3<f64>>();
             let poses = pose_covariance(normal, &window, views, spreads, &(middle / benches.len() as f64));
-            let shared_m = 0.5 * spreads.group_px / views[main].px_per_m();
+            let shared_m = (params.common_share * spreads.group_px / views[main].px_per_m()).hypot(measured.common_m);
             benches
                 .into_iter()
                 .map(|bench| {
-                    let boxes = *normal.bench_alone(bench);
+                    let boxes = scaled(normal.bench_alone(bench));
                     let whole = boxes + carried_covariance(normal, bench, &window, &poses);
                     (bench, Uncertainty { whole, boxes, shared_m })
                 })
@@ -116,8 +164,8 @@ fn carried_covariance(normal: &Normal, bench: usize, window: &[usize], poses: &D
 }
 
 /// Variance of each number of each view's correction; where there are many views, as if the others were known.
-pub(super) fn pose_variances(normal: &Normal, views: usize) -> Vec<Vector6<f64>> {
-    if views > EXACT_VIEWS {
+pub(super) fn pose_variances(normal: &Normal, views: usize, exact_views: usize) -> Vec<Vector6<f64>> {
+    if views > exact_views {
         return (0..views).into_par_iter().map(|view| normal.alone(view).diagonal()).collect();
     }
     let mut matrix = DMatrix::<f64>::zeros(6 * views, 6 * views);

@@ -4,7 +4,9 @@
 //! if all the sightings of a view on a bench (or of one of its pieces there) do, they are moved there together and the plant
 //! is adjusted again. What lies off by no whole number shows no module of this bench and is left out.
 
+use super::adopt::adopt;
 use super::consensus::agree;
+use super::exclusion::exclude;
 use super::{Refined, RefinementOptions, refine};
 use crate::fusion::{Fused, FusedBench, FusedModule, Observation, View};
 use nalgebra::{Matrix2, Vector2};
@@ -30,7 +32,7 @@ pub fn refine_verified(views: &[View<'_>], fused: &mut Fused, options: &Refineme
         return refine(views, fused, options);
     }
     fused.benches.par_iter_mut().for_each(|bench| {
-        agree(bench, options.params.most_rest_pitches);
+        agree(bench, &options.params);
     });
     let mut refined = refine(views, fused, options);
     for _ in 0..options.params.most_verifications {
@@ -43,11 +45,12 @@ pub fn refine_verified(views: &[View<'_>], fused: &mut Fused, options: &Refineme
                 if verdicts.is_empty() { 0 } else { replace(bench, &verdicts) }
             })
             .sum();
-        if moved == 0 {
+        if moved + adopt(views, fused, &refined, &options.params) == 0 {
             break;
         }
         refined = refine(views, fused, options);
     }
+    exclude(views, fused, &mut refined, &options.params);
     refined
 }
 
@@ -98,7 +101,7 @@ fn verdicts(
 }
 
 /// Metres per column and per row.
-fn pitches(bench: &FusedBench, refined: &Refined, index: usize) -> [f64; 2] {
+pub(super) fn pitches(bench: &FusedBench, refined: &Refined, index: usize) -> [f64; 2] {
     let lattice = &refined.benches[index];
     let mut best = [None::<(i32, f64)>; 2];
     let (Some(first), Some(origin)) = (bench.modules.first(), lattice.modules.first()) else { return [1.0; 2] };

@@ -69,6 +69,13 @@ impl AdjustedView {
         (self.focal_px[0] + self.focal_px[1]) / 2.0 / self.pivot.z.max(0.1)
     }
 
+    /// What a small offset in the image is on the ground, in the middle of the view, metres east and north.
+    pub(super) fn on_ground(&self, offset_px: Vector2<f64>) -> Vector2<f64> {
+        let [fx, fy] = self.focal_px;
+        let in_camera = Vector3::new(offset_px.x / fx, offset_px.y / fy, 0.0) * self.pivot.z;
+        (self.adjusted_rotation.transpose() * in_camera).xy()
+    }
+
     pub(super) fn correction(&self) -> &Vector6<f64> {
         &self.correction
     }

@@ -1,6 +1,7 @@
 //! Layout, fusion and refinement on simulated plants: what comes out must be the plant that went in.
 
 mod contract;
+mod detectors;
 mod geometry;
 
 use heliomap_mapping::assembly::{Identity, assemble};
