@@ -101,47 +101,7 @@ fn assemble_bench(
     doubts: &mut Vec<OpenDoubt>,
 ) -> Option<FusedBench> {
     let (members, margin) = (&clusters.members[cluster], clusters.margins[cluster]);
-    let mut votes = Places::new();
-    for &member in members {
-        let (piece, place) = (&pieces[member], clusters.placements[member]);
-        for cell in &piece.cells {
-            let entry = votes.entry((cell.row + place.row, cell.col + place.col)).or_default();
-            match cell.detection {
-                Some(detection) => entry.observations.push(Observation {
-                    view: piece.view,
-                    detection,
-                    position_m: cell.position_m,
-                    cloud_m: cell.cloud_m,
-                }),
-                None => {
-                    entry.inferred.insert(piece.view);
-                }
-            }
-        }
-    }
-    let places: Vec<(i32, i32)> = votes.keys().copied().collect();
-    let extents = Extent::of_views(pieces, clusters, members);
-    for extent in &extents {
-        for &(row, col) in &places {
-            if extent.ends_before(row, col) && extent.shows(&views[extent.view], pieces, clusters, row, col) {
-                votes.entry((row, col)).or_default().absent.insert(extent.view);
-            }
-        }
-    }
-    for ((row, col), entry) in &mut votes {
-        // A view that shows the place in another of its pieces does not miss it.
-        for observation in &entry.observations {
-            entry.absent.remove(&observation.view);
-            entry.inferred.remove(&observation.view);
-        }
-        entry.observed = entry.observations.len();
-        if let [alone] = entry.observations[..] {
-            let others =
-                extents.iter().filter(|extent| extent.view != alone.view && !entry.inferred.contains(&extent.view));
-            let looking = others.filter(|extent| extent.shows(&views[extent.view], pieces, clusters, *row, *col));
-            entry.unseen = looking.map(|extent| extent.view).collect();
-        }
-    }
+    let votes = votes(views, pieces, clusters, members);
     // Modules are those that were visually confirmed; past the ends that most views see, one detection is no proof.
     let (mut accepted, outvoted): (Places, Places) = votes
         .into_iter()
@@ -205,6 +165,52 @@ fn assemble_bench(
         .collect();
     doubts.extend(places_to_check(views, &bench, &contested));
     Some(bench)
+}
+
+/// What all views say of all places of a bench.
+fn votes(views: &[View<'_>], pieces: &[LocatedPiece], clusters: &Clusters, members: &[usize]) -> Places {
+    let mut votes = Places::new();
+    for &member in members {
+        let (piece, place) = (&pieces[member], clusters.placements[member]);
+        for cell in &piece.cells {
+            let entry = votes.entry((cell.row + place.row, cell.col + place.col)).or_default();
+            match cell.detection {
+                Some(detection) => entry.observations.push(Observation {
+                    view: piece.view,
+                    detection,
+                    position_m: cell.position_m,
+                    cloud_m: cell.cloud_m,
+                }),
+                None => {
+                    entry.inferred.insert(piece.view);
+                }
+            }
+        }
+    }
+    let places: Vec<(i32, i32)> = votes.keys().copied().collect();
+    let extents = Extent::of_views(pieces, clusters, members);
+    for extent in &extents {
+        for &(row, col) in &places {
+            if extent.ends_before(row, col) && extent.shows(&views[extent.view], pieces, clusters, row, col) {
+                votes.entry((row, col)).or_default().absent.insert(extent.view);
+            }
+        }
+    }
+    for ((row, col), entry) in &mut votes {
+        // A view that shows the place in another of its pieces does not miss it.
+        for observation in &entry.observations {
+            entry.absent.remove(&observation.view);
+            entry.inferred.remove(&observation.view);
+        }
+        entry.observed = entry.observations.len();
+        if let [alone] = entry.observations[..] {
+            let others =
+                extents.iter().filter(|extent| extent.view != alone.view && !entry.inferred.contains(&extent.view));
+            let looking = others.filter(|extent| extent.shows(&views[extent.view], pieces, clusters, *row, *col));
+            entry.unseen = looking.map(|extent| extent.view).collect();
+        }
+    }
+    votes
 }
 
 /// What one view shows of a bench: all its pieces together, for a bench may come in parts where modules were missed.
@@ -358,30 +364,7 @@ pub(super) fn without_ghosts(
             3 * covered <= bench.modules.len()
         };
         if !kept[index] {
-            let names: BTreeSet<String> = bench
-                .modules
-                .iter()
-                .flat_map(|m| m.observations.iter().map(|o| views[o.view].shot.name.clone()))
-                .collect();
-            let at = over.map_or(bench.middle_m, |k| benches[k].middle_m);
-            let clusters = std::iter::once(bench.cluster).chain(over.map(|k| benches[k].cluster)).collect();
-            let doubt = Doubt {
-                code: "bench_seen_apart".into(),
-                message: format!(
-                    "{} modules seen at {:.1} m east, {:.1} m north lie over the bench at {:.1} m east, {:.1} m north, but \
-                     do not fit its lattice; they are left out: check these images",
-                    bench.modules.len(),
-                    bench.middle_m.x,
-                    bench.middle_m.y,
-                    at.x,
-                    at.y
-                ),
-                images: names.into_iter().collect(),
-                benches: Vec::new(),
-                sightings: bench.sightings().collect(),
-                places_m: vec![bench.middle_m.xy()],
-            };
-            left_out.push(OpenDoubt { doubt, clusters });
+            left_out.push(seen_apart(views, bench, over.map(|k| &benches[k])));
         }
     }
     // What was said of places inside of benches that are left out says nothing of the model.
@@ -390,6 +373,30 @@ pub(super) fn without_ghosts(
     doubts.retain(|said| !matches!(said.clusters[..], [cluster] if ghosts.contains(&cluster)));
     doubts.extend(left_out);
     benches.into_iter().zip(kept).filter_map(|(bench, keep)| keep.then_some(bench)).collect()
+}
+
+/// A bench that is left out, and the one over which it lies.
+fn seen_apart(views: &[View<'_>], bench: &FusedBench, over: Option<&FusedBench>) -> OpenDoubt {
+    let names: BTreeSet<String> = bench.sightings().map(|(view, _)| views[view].shot.name.clone()).collect();
+    let at = over.map_or(bench.middle_m, |other| other.middle_m);
+    let doubt = Doubt {
+        code: "bench_seen_apart".into(),
+        message: format!(
+            "{} modules seen at {:.1} m east, {:.1} m north lie over the bench at {:.1} m east, {:.1} m north, but do not fit \
+             its lattice; they are left out: check these images",
+            bench.modules.len(),
+            bench.middle_m.x,
+            bench.middle_m.y,
+            at.x,
+            at.y
+        ),
+        images: names.into_iter().collect(),
+        benches: Vec::new(),
+        sightings: bench.sightings().collect(),
+        places_m: vec![bench.middle_m.xy()],
+    };
+    let clusters = std::iter::once(bench.cluster).chain(over.map(|other| other.cluster)).collect();
+    OpenDoubt { doubt, clusters }
 }
 
 /// How many views show the place of a bench, wholly in their frame, and have no part in it.

@@ -46,43 +46,9 @@ pub(super) fn arrange(
     doubts: &mut Vec<OpenDoubt>,
 ) -> (Vec<FusedLine>, Vec<FusedBench>) {
     let footprints: Vec<Footprint> = benches.iter().map(Footprint::of).collect();
-    let count = benches.len();
-    let cell_m = params.line_gap_m;
-    let key = |p: Vector2<f64>| ((p.x / cell_m).floor() as i64, (p.y / cell_m).floor() as i64);
-    let mut wests: std::collections::HashMap<(i64, i64), Vec<usize>> = std::collections::HashMap::new();
-    for (index, footprint) in footprints.iter().enumerate() {
-        wests.entry(key(footprint.west)).or_default().push(index);
-    }
-    // (distance, from, to): the east end of one faces the west end of the other.
-    let mut facing: Vec<(f64, usize, usize)> = Vec::new();
-    let mut doubtful: Vec<(usize, usize)> = Vec::new();
-    for (i, from) in footprints.iter().enumerate() {
-        let home = key(from.east);
-        for dx in -2..=2 {
-            for dy in -2..=2 {
-                for &j in wests.get(&(home.0 + dx, home.1 + dy)).into_iter().flatten() {
-                    let to = &footprints[j];
-                    if i == j || from.along.angle(&to.along) > params.line_bend_deg.to_radians() {
-                        continue;
-                    }
-                    let offset = to.west - from.east;
-                    let (gap, aside) = (offset.dot(&from.along), offset.dot(&from.across));
-                    let within = |share: f64| aside.abs() < share * (from.half_m + to.half_m) + 0.05 * gap;
-                    if !(-1.0..params.line_gap_m).contains(&gap) {
-                        continue;
-                    }
-                    if within(params.line_aside) {
-                        facing.push((gap.max(0.0) + 2.0 * aside.abs(), i, j));
-                    } else if within(params.line_doubtful_aside) {
-                        doubtful.push((i, j));
-                    }
-                }
-            }
-        }
-    }
-    facing.sort_by(|a, b| a.0.total_cmp(&b.0).then((a.1, a.2).cmp(&(b.1, b.2))));
-    let mut next = vec![None; count];
-    let mut previous = vec![None; count];
+    let Pairs { facing, doubtful } = pairs(&footprints, params);
+    let mut next = vec![None; benches.len()];
+    let mut previous = vec![None; benches.len()];
     for (_, i, j) in facing {
         if next[i].is_none() && previous[j].is_none() {
             next[i] = Some(j);
@@ -92,13 +58,62 @@ pub(super) fn arrange(
     let touching = |(i, next): (usize, &Option<usize>)| next.map(|j| (i, j));
     let joined: Vec<(usize, usize)> = next.iter().enumerate().filter_map(touching).collect();
     doubts.extend(joined.into_iter().filter_map(|(i, j)| bench_or_hole(&benches[i], &benches[j], params)));
-    doubtful.sort_unstable();
     doubts.extend(
         doubtful
             .into_iter()
             .filter(|&(i, j)| next[i].is_none() && previous[j].is_none())
             .map(|(i, j)| line_unsure(&benches[i], &benches[j])),
     );
+    let lines = chains(&next, &previous);
+    sorted(lines, benches, &footprints)
+}
+
+/// Benches that face each other by their ends, the western one first.
+struct Pairs {
+    /// With what speaks against it, metres; the surest first.
+    facing: Vec<(f64, usize, usize)>,
+    /// By the corners of their ends alone.
+    doubtful: Vec<(usize, usize)>,
+}
+
+fn pairs(footprints: &[Footprint], params: &FusionParams) -> Pairs {
+    let cell_m = params.line_gap_m;
+    let key = |p: Vector2<f64>| ((p.x / cell_m).floor() as i64, (p.y / cell_m).floor() as i64);
+    let mut wests: std::collections::HashMap<(i64, i64), Vec<usize>> = std::collections::HashMap::new();
+    for (index, footprint) in footprints.iter().enumerate() {
+        wests.entry(key(footprint.west)).or_default().push(index);
+    }
+    let mut pairs = Pairs { facing: Vec::new(), doubtful: Vec::new() };
+    for (i, from) in footprints.iter().enumerate() {
+        let home = key(from.east);
+        for (dx, dy) in (-2..=2).flat_map(|dx| (-2..=2).map(move |dy| (dx, dy))) {
+            for &j in wests.get(&(home.0 + dx, home.1 + dy)).into_iter().flatten() {
+                let to = &footprints[j];
+                if i == j || from.along.angle(&to.along) > params.line_bend_deg.to_radians() {
+                    continue;
+                }
+                let offset = to.west - from.east;
+                let (gap, aside) = (offset.dot(&from.along), offset.dot(&from.across));
+                let within = |share: f64| aside.abs() < share * (from.half_m + to.half_m) + 0.05 * gap;
+                if !(-1.0..params.line_gap_m).contains(&gap) {
+                    continue;
+                }
+                if within(params.line_aside) {
+                    pairs.facing.push((gap.max(0.0) + 2.0 * aside.abs(), i, j));
+                } else if within(params.line_doubtful_aside) {
+                    pairs.doubtful.push((i, j));
+                }
+            }
+        }
+    }
+    pairs.facing.sort_by(|a, b| a.0.total_cmp(&b.0).then((a.1, a.2).cmp(&(b.1, b.2))));
+    pairs.doubtful.sort_unstable();
+    pairs
+}
+
+/// Benches one behind the other, from the first of each line; where they run in a circle, from any.
+fn chains(next: &[Option<usize>], previous: &[Option<usize>]) -> Vec<Vec<usize>> {
+    let count = next.len();
     let mut seen = vec![false; count];
     let mut lines: Vec<Vec<usize>> = Vec::new();
     for start in (0..count).filter(|k| previous[*k].is_none()).chain(0..count) {
@@ -113,7 +128,15 @@ pub(super) fn arrange(
             lines.push(line);
         }
     }
-    // One order for the whole plant: across the rows of most modules.
+    lines
+}
+
+/// Lines and benches in one order for the whole plant: across the rows of most modules.
+fn sorted(
+    lines: Vec<Vec<usize>>,
+    benches: Vec<FusedBench>,
+    footprints: &[Footprint],
+) -> (Vec<FusedLine>, Vec<FusedBench>) {
     let across = footprints
         .iter()
         .zip(&benches)
@@ -133,7 +156,7 @@ pub(super) fn arrange(
     let mut placed: Vec<(f64, Vec<usize>)> = lines.into_iter().map(|line| (place(&line), line)).collect();
     placed.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
     let order: Vec<usize> = placed.iter().flat_map(|(_, line)| line.iter().copied()).collect();
-    let mut new_index = vec![0; count];
+    let mut new_index = vec![0; benches.len()];
     for (new, old) in order.iter().enumerate() {
         new_index[*old] = new;
     }

@@ -26,40 +26,7 @@ pub(super) fn cut_gaps(
     grey: Option<&GrayImage>,
     options: &LayoutOptions,
 ) {
-    let sides = component.sides(nodes);
-    let scale = sides[0].norm().min(sides[1].norm());
-    // For each axis: (transition, position across it) -> the two nodes and by how much they stand too far apart, by the
-    // pitch of the component and by their own sides.
-    let crossings = [0, 1].map(|axis| {
-        let mut found: BTreeMap<(i32, i32), Crossing> = BTreeMap::new();
-        for (&(col, row), &i) in &component.places {
-            let next = if axis == 0 { (col + 1, row) } else { (col, row + 1) };
-            if let Some(&j) = component.places.get(&next) {
-                let own = (axis + component.turns[&i]) % 4;
-                if matches!(links[i][own], Some((k, _)) if k == j) {
-                    let theirs = (axis + component.turns[&j]) % 4;
-                    let apart = (nodes[j].center - nodes[i].center).norm();
-                    let half = (nodes[i].direction(own).norm() + nodes[j].direction(theirs).norm()) / 2.0;
-                    let crossing = Crossing { nodes: (i, j), by_pitch: 0.0, by_sides: (apart - half) / scale };
-                    found.insert(if axis == 0 { (col, row) } else { (row, col) }, crossing);
-                }
-            }
-        }
-        let lengths: Vec<(Vector2<f64>, f64)> = found
-            .values()
-            .map(|crossing| crossing.nodes)
-            .map(|(i, j)| ((nodes[i].center + nodes[j].center) / 2.0, (nodes[j].center - nodes[i].center).norm()))
-            .collect();
-        if !lengths.is_empty() {
-            let expected = pitch_model(&lengths, sides[axis].norm());
-            let seam = median(&mut found.values().map(|crossing| crossing.by_sides).collect::<Vec<_>>());
-            for ((crossing, (_, length)), pitch) in found.values_mut().zip(&lengths).zip(expected) {
-                crossing.by_pitch = (length - pitch) / scale;
-                crossing.by_sides -= seam;
-            }
-        }
-        found
-    });
+    let crossings = [0, 1].map(|axis| crossings(component, nodes, links, axis));
     for axis in 0..2 {
         let keys: Vec<(i32, i32)> = crossings[axis].keys().copied().collect();
         let links_here: Vec<Crossing> = crossings[axis].values().copied().collect();
@@ -107,6 +74,46 @@ pub(super) fn cut_gaps(
             start = end;
         }
     }
+}
+
+/// All links along an axis, by transition and position across it: the two modules, and by how much they stand too far apart by the
+/// pitch of the component and by their own sides.
+fn crossings(
+    component: &Component,
+    nodes: &[Node],
+    links: &[[Link; 4]],
+    axis: usize,
+) -> BTreeMap<(i32, i32), Crossing> {
+    let sides = component.sides(nodes);
+    let scale = sides[0].norm().min(sides[1].norm());
+    let mut found: BTreeMap<(i32, i32), Crossing> = BTreeMap::new();
+    for (&(col, row), &i) in &component.places {
+        let next = if axis == 0 { (col + 1, row) } else { (col, row + 1) };
+        if let Some(&j) = component.places.get(&next) {
+            let own = (axis + component.turns[&i]) % 4;
+            if matches!(links[i][own], Some((k, _)) if k == j) {
+                let theirs = (axis + component.turns[&j]) % 4;
+                let apart = (nodes[j].center - nodes[i].center).norm();
+                let half = (nodes[i].direction(own).norm() + nodes[j].direction(theirs).norm()) / 2.0;
+                let crossing = Crossing { nodes: (i, j), by_pitch: 0.0, by_sides: (apart - half) / scale };
+                found.insert(if axis == 0 { (col, row) } else { (row, col) }, crossing);
+            }
+        }
+    }
+    let lengths: Vec<(Vector2<f64>, f64)> = found
+        .values()
+        .map(|crossing| crossing.nodes)
+        .map(|(i, j)| ((nodes[i].center + nodes[j].center) / 2.0, (nodes[j].center - nodes[i].center).norm()))
+        .collect();
+    if !lengths.is_empty() {
+        let expected = pitch_model(&lengths, sides[axis].norm());
+        let seam = median(&mut found.values().map(|crossing| crossing.by_sides).collect::<Vec<_>>());
+        for ((crossing, (_, length)), pitch) in found.values_mut().zip(&lengths).zip(expected) {
+            crossing.by_pitch = (length - pitch) / scale;
+            crossing.by_sides -= seam;
+        }
+    }
+    found
 }
 
 /// The expected distance at each link: the logarithm of the length is fitted as an affine function of the position, gaps

@@ -61,6 +61,29 @@ impl Component {
         LatticeMap::fit(&samples, u * 1.02, v * 1.02)
     }
 
+    /// Turns the lattice by quarter turns.
+    fn turn(&mut self, turn: usize) {
+        if turn == 0 {
+            return;
+        }
+        let places = std::mem::take(&mut self.places);
+        self.places = places
+            .into_iter()
+            .map(|((col, row), node)| {
+                let place = match turn {
+                    1 => (row, -col),
+                    2 => (-col, -row),
+                    _ => (-row, col),
+                };
+                (place, node)
+            })
+            .collect();
+        for node_turn in self.turns.values_mut() {
+            *node_turn = (*node_turn + turn) % 4;
+        }
+        self.bridges.clear();
+    }
+
     pub(super) fn col_range(&self) -> (i32, i32) {
         range(self.places.keys().map(|place| place.0))
     }
@@ -358,30 +381,12 @@ fn orient(grown: &mut [Component], nodes: &[Node], long_columns: i32) {
         };
         let along = if along_u { u } else { v };
         let forward = if along.x.abs() > 0.2 * along.y.abs() { along.x > 0.0 } else { along.y > 0.0 };
-        let turn = match (along_u, forward) {
+        component.turn(match (along_u, forward) {
             (true, true) => 0,
             (true, false) => 2,
             (false, true) => 1,
             (false, false) => 3,
-        };
-        if turn != 0 {
-            let places = std::mem::take(&mut component.places);
-            component.places = places
-                .into_iter()
-                .map(|((col, row), node)| {
-                    let place = match turn {
-                        1 => (row, -col),
-                        2 => (-col, -row),
-                        _ => (-row, col),
-                    };
-                    (place, node)
-                })
-                .collect();
-            for node_turn in component.turns.values_mut() {
-                *node_turn = (*node_turn + turn) % 4;
-            }
-            component.bridges.clear();
-        }
+        });
         // Columns without any detection are bridges, whatever joined them.
         let (low, high) = component.col_range();
         component.bridges = (low..high)

@@ -77,16 +77,9 @@ struct Attachment {
     bridge: i32,
 }
 
-/// How `part` stands in the lattice of `base`, if it does; each with its module's sides.
-fn attachment(
-    (base, base_sides): (&Component, [Vector2<f64>; 2]),
-    map: &LatticeMap,
-    (part, part_sides): (&Component, [Vector2<f64>; 2]),
-    nodes: &[Node],
-    options: &LayoutOptions,
-) -> Option<Attachment> {
-    let params = &options.params;
-    let directions = [part_sides[0], part_sides[1], -part_sides[0], -part_sides[1]];
+/// Quarter turns between two lattices, given the sides of the modules of the one and the four directions of the other's; `None`
+/// where their modules differ.
+fn turn_between(base_sides: [Vector2<f64>; 2], directions: [Vector2<f64>; 4], params: &LayoutParams) -> Option<usize> {
     let turn = (0..4).max_by(|&s, &t| {
         let cosine = |k: usize| base_sides[0].dot(&directions[k]) / directions[k].norm();
         cosine(s).total_cmp(&cosine(t))
@@ -99,6 +92,20 @@ fn attachment(
             return None;
         }
     }
+    Some(turn)
+}
+
+/// How `part` stands in the lattice of `base`, if it does; each with its module's sides.
+fn attachment(
+    (base, base_sides): (&Component, [Vector2<f64>; 2]),
+    map: &LatticeMap,
+    (part, part_sides): (&Component, [Vector2<f64>; 2]),
+    nodes: &[Node],
+    options: &LayoutOptions,
+) -> Option<Attachment> {
+    let params = &options.params;
+    let directions = [part_sides[0], part_sides[1], -part_sides[0], -part_sides[1]];
+    let turn = turn_between(base_sides, directions, params)?;
     let (col_low, col_high) = base.col_range();
     let (row_low, row_high) = base.row_range();
     let reach = f64::from(options.max_missing + 2);
@@ -153,24 +160,35 @@ fn attachment(
     if !rows_shared && (part_low < col_low - 1 || part_high > col_high + 1) {
         return None;
     }
-    // What stands a gap apart is another bench, whatever the lattice as a whole allows.
     let placed: BTreeMap<(i32, i32), usize> = places.into_iter().zip(part.places.values().copied()).collect();
-    let shorter = base_sides[0].norm().min(base_sides[1].norm());
-    for (axis, ends) in [
-        (0, facing_ends((col_low, col_high), (part_low, part_high))),
-        (1, facing_ends((row_low, row_high), (part_row_low, part_row_high))),
-    ] {
-        // The pitch in between is neither of both where tables lean away from each other.
-        let leaning = (1.0 + directions[(turn + axis) % 4].norm() / base_sides[axis].norm()) / 2.0;
-        let excess =
-            ends.and_then(|ends| excess(base, &placed, map, nodes, (axis, leaning), ends, params.many_crossings));
-        if excess.is_some_and(|excess| {
-            excess.abs() > params.sure_gap * options.gap_threshold * shorter / base_sides[axis].norm()
-        }) {
-            return None;
-        }
+    let ends = [
+        facing_ends((col_low, col_high), (part_low, part_high)),
+        facing_ends((row_low, row_high), (part_row_low, part_row_high)),
+    ];
+    let part_sides = [0, 1].map(|axis| directions[(turn + axis) % 4].norm());
+    if stands_apart((base, base_sides, map), (&placed, part_sides), nodes, ends, options) {
+        return None;
     }
     Some(Attachment { shift, turn, missing, bridge })
+}
+
+/// Whether a part stands a gap apart: then it is another bench, whatever the lattice as a whole allows.
+fn stands_apart(
+    (base, base_sides, map): (&Component, [Vector2<f64>; 2], &LatticeMap),
+    (placed, part_sides): (&BTreeMap<(i32, i32), usize>, [f64; 2]),
+    nodes: &[Node],
+    ends: [Option<(i32, i32)>; 2],
+    options: &LayoutOptions,
+) -> bool {
+    let shorter = base_sides[0].norm().min(base_sides[1].norm());
+    ends.into_iter().enumerate().any(|(axis, ends)| {
+        // The pitch in between is neither of both where tables lean away from each other.
+        let leaning = (1.0 + part_sides[axis] / base_sides[axis].norm()) / 2.0;
+        let many = options.params.many_crossings;
+        let excess = ends.and_then(|ends| excess(base, placed, map, nodes, (axis, leaning), ends, many));
+        let least = options.params.sure_gap * options.gap_threshold * shorter / base_sides[axis].norm();
+        excess.is_some_and(|excess| excess.abs() > least)
+    })
 }
 
 /// The ends at which two ranges face each other, that of the first one first; `None` where they overlap.
