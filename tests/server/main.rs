@@ -438,7 +438,7 @@ fn blobs_lie_in_a_bucket() {
     let client = client();
     let (_, job) = broken_survey_with_job(&client, &base);
     let job = follow(&client, &base, &job);
-    assert_eq!(job["error"]["code"], "reconstruction_malformed", "{job}");
+    assert_eq!(job["error"]["code"], "points_missing", "{job}");
     assert!(!data.path().join("blobs").exists());
     let list = format!("{endpoint}/heliomap-tests?list-type=2&prefix={prefix}/");
     let list = || client.get(&list).send().unwrap().text().unwrap();

@@ -2,7 +2,7 @@
 
 use super::mask_to_boxes::ModuleBox;
 use super::merge::merge;
-use super::{Detection, DetectionError, Detector, Unet, Yolo, filter, lattice, periodicity, registration};
+use super::{Detection, DetectionError, Detector, Unet, Yolo, filter, halves, lattice, periodicity, registration};
 use crate::geometry::Quad;
 use image::RgbImage;
 use nalgebra::Vector2;
@@ -50,6 +50,7 @@ pub(super) fn detect(
             boxes = as_taken;
         }
     }
+    let mut boxes = halves::join_halves(boxes, image, gsd_m);
     registration::register(&mut boxes, image)?;
     Ok(boxes.iter().filter_map(detection).filter(|d| filter::is_inside_frame(&d.quad.corners, width, height)).collect())
 }

@@ -7,6 +7,7 @@
 mod detectors;
 pub mod external;
 pub mod filter;
+mod halves;
 mod lattice;
 pub mod mask_to_boxes;
 mod merge;
