@@ -96,7 +96,7 @@ fn an_engine_that_fails_is_an_error_with_its_last_words() {
     assert_eq!(crashed.code(), "engine_failed");
     assert!(crashed.to_string().contains("out of memory"), "{crashed}");
     let refused =
-        r#"cat > /dev/null; echo '{"error": {"code": "nothing_reconstructed", "message": "no two photos fit"}}'"#;
+        r#"read -r request; echo '{"error": {"code": "nothing_reconstructed", "message": "no two photos fit"}}'"#;
     let refused = failure(&folder, &options(script(&folder, refused)));
     assert_eq!((refused.code(), refused.to_string().as_str()), ("nothing_reconstructed", "no two photos fit"));
     let elsewhere =
