@@ -62,7 +62,6 @@ codes! {
     ModuleNotFound = NOT_FOUND, "module_not_found", "There is no such module";
     FileNotFound = NOT_FOUND, "file_not_found", "There is no such file";
     MethodNotAllowed = METHOD_NOT_ALLOWED, "method_not_allowed", "The method does not apply here";
-    NotAcceptable = NOT_ACCEPTABLE, "not_acceptable", "No answer can be sent in that way";
     Timeout = REQUEST_TIMEOUT, "timeout", "The request took too long";
     UploadStalled = REQUEST_TIMEOUT, "upload_stalled", "The upload stood still";
     SurveyIncomplete = CONFLICT, "survey_incomplete", "The survey cannot be mapped yet";
@@ -293,7 +292,7 @@ pub fn describe(description: &mut OpenApi) {
                     codes.extend(named(text));
                 }
             }
-            codes.extend([Code::Internal, Code::NotAcceptable]);
+            codes.insert(Code::Internal);
             if path.contains('{') {
                 codes.insert(Code::NotFound);
             }

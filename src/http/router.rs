@@ -4,7 +4,7 @@ use super::controllers::{
     events, features, file_deletion, files, health, images, jobs, keys, models, openapi as api_description, page,
     plants, surveys, usage, webhooks,
 };
-use super::description::examples;
+use super::description::{examples, responses};
 use super::error;
 use super::middleware::access::{Gate, Policy};
 use super::middleware::head::{self, MAX_JSON_BYTES};
@@ -115,6 +115,7 @@ pub fn openapi() -> utoipa::openapi::OpenApi {
     conditional::describe(&mut description);
     error::describe(&mut description);
     examples::describe(&mut description);
+    responses::share(&mut description);
     description
 }
 
@@ -144,7 +145,7 @@ pub fn router(state: AppState) -> Router {
         .layer(middleware::map_response(error::only_problems))
         // A plant is megabytes of JSON, which little effort makes small.
         .layer(CompressionLayer::new().quality(CompressionLevel::Fastest))
-        .layer(middleware::from_fn(encoding::acceptable))
+        .layer(middleware::from_fn(encoding::choose))
         .layer(middleware::map_response(as_it_says))
         .layer(tower::util::option_layer(cors.map(|layer| middleware::from_fn_with_state(layer, cross_origin))))
         .layer(PropagateRequestIdLayer::new(REQUEST_ID))

@@ -61,19 +61,45 @@ async fn real_answers_are_as_described() {
     validate(&description, "UploadedFile", &app.put(&format!("{survey}/images/a.jpg"), crate::app::jpeg(8, 8)).await.1);
 }
 
+/// A response where it is described: in place, or among the shared ones.
+fn resolved<'a>(description: &'a Value, response: &'a Value) -> &'a Value {
+    match response["$ref"].as_str() {
+        Some(reference) => description.pointer(&reference[1..]).unwrap_or_else(|| panic!("{reference}")),
+        None => response,
+    }
+}
+
+/// Whether a path is one of a template's.
+fn matches(template: &str, path: &str) -> bool {
+    let pairs = template.split('/').zip(path.split('/'));
+    template.split('/').count() == path.split('/').count()
+        && pairs
+            .into_iter()
+            .all(|(wanted, found)| wanted == found || (wanted.starts_with('{') && !found.starts_with('{')))
+}
+
 #[test]
-fn every_operation_tells_its_problems_by_their_status() {
+fn shared_responses_are_used_more_than_once() {
+    let text = serde_json::to_string(&openapi()).unwrap();
+    let description = serde_json::to_value(openapi()).unwrap();
+    let shared = description["components"]["responses"].as_object().unwrap();
+    assert!(shared.len() > 10);
+    for name in shared.keys() {
+        assert!(text.matches(&format!("#/components/responses/{name}\"")).count() > 1, "{name}");
+    }
+}
+
+#[test]
+fn operations_list_problems_by_status() {
     let description = serde_json::to_value(openapi()).unwrap();
     for (path, operations) in description["paths"].as_object().unwrap() {
         for (method, operation) in operations.as_object().unwrap().iter().filter(|(method, _)| *method != "options") {
             let responses = operation["responses"].as_object().unwrap();
             assert!(responses.keys().all(|status| status.parse::<u16>().is_ok()), "{method} {path}");
-            for (status, code) in [("500", "internal_error"), ("406", "not_acceptable")] {
-                let told = responses[status]["description"].as_str().unwrap();
-                assert!(told.contains(&format!("`{code}`")), "{method} {path} {status}: {told}");
-            }
-            if responses.contains_key("429") {
-                assert!(responses["429"]["headers"]["retry-after"].is_object(), "{method} {path}");
+            let text = resolved(&description, &responses["500"])["description"].as_str().unwrap();
+            assert!(text.contains("`internal_error`"), "{method} {path}: {text}");
+            if let Some(limited) = responses.get("429") {
+                assert!(resolved(&description, limited)["headers"]["retry-after"].is_object(), "{method} {path}");
             }
         }
     }
@@ -86,12 +112,16 @@ fn every_answer_has_an_example_that_is_as_described() {
     for (path, operations) in description["paths"].as_object().unwrap() {
         for (method, operation) in operations.as_object().unwrap().iter().filter(|(method, _)| *method != "options") {
             for (status, response) in operation["responses"].as_object().unwrap() {
+                let response = resolved(&description, response);
                 for (media_type, content) in response["content"].as_object().into_iter().flatten() {
                     let about = format!("{method} {path} {status}");
                     let component = content["schema"]["$ref"].as_str().and_then(|schema| schema.rsplit('/').next());
                     match (media_type.as_str(), component) {
                         ("application/json" | "application/geo+json", Some(component)) => {
                             assert!(content["example"].is_object(), "{about}");
+                            if let Some(next) = content["example"]["next"].as_str() {
+                                assert!(matches(path, next.split('?').next().unwrap()), "{about}: {next}");
+                            }
                             validate(&description, component, &content["example"]);
                         }
                         ("application/problem+json", Some(component)) => {
@@ -156,8 +186,9 @@ async fn real_problems_are_as_described() {
         let (status, problem) = crate::app::json_of(request.send().await.unwrap()).await;
         assert_eq!(problem["code"], code, "{method} {path}: {problem}");
         validate(&description, "Problem", &problem);
-        let told = &description["paths"][&template][method]["responses"][status.as_str()]["description"];
-        assert!(told.as_str().is_some_and(|told| told.contains(&format!("`{code}`"))), "{method} {template}: {told}");
+        let responses = &description["paths"][&template][method]["responses"];
+        let text = &resolved(&description, &responses[status.as_str()])["description"];
+        assert!(text.as_str().is_some_and(|text| text.contains(&format!("`{code}`"))), "{method} {template}: {text}");
     }
 }
 

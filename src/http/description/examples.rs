@@ -9,10 +9,16 @@ use utoipa::openapi::{OpenApi, Ref, RefOr};
 /// Schemas within schemas that are followed at the most.
 const DEEPEST: usize = 40;
 
+/// The identifier that stands in examples.
+const EXAMPLE_ID: &str = "0b7a3f7e-59b1-4f0c-9f0d-3d6f3d1f7a11";
+
+/// The cursor that stands in examples of links to the next part.
+const EXAMPLE_CURSOR: &str = "17";
+
 /// Gives every answer in JSON an example: of what is served, and of each problem that an answer's description names.
 pub fn describe(description: &mut OpenApi) {
     let schemas = json!(description.components.as_ref().map(|components| &components.schemas));
-    for item in description.paths.paths.values_mut() {
+    for (path, item) in &mut description.paths.paths {
         for (_, operation) in error::operations(item) {
             for (status, response) in &mut operation.responses.responses {
                 let RefOr::T(response) = response else { continue };
@@ -24,7 +30,7 @@ pub fn describe(description: &mut OpenApi) {
                             content.examples = codes.iter().map(|code| of_problem(*code, status)).collect();
                         }
                         "application/json" | "application/geo+json" => {
-                            content.example = whole(content, &schemas);
+                            content.example = whole(content, &schemas).map(|example| with_next(example, path));
                         }
                         _ => {}
                     }
@@ -54,6 +60,21 @@ fn of_problem(code: Code, status: &str) -> (String, RefOr<Example>) {
         _ => RefOr::Ref(Ref::new(format!("#/components/examples/{word}"))),
     };
     (word.to_owned(), example)
+}
+
+/// Points an example's link to the next part at the operation that the example is of.
+fn with_next(mut example: Value, path: &str) -> Value {
+    if let Some(next) = example.get_mut("next").filter(|next| next.is_string()) {
+        let segment = |segment: &str| match segment {
+            "{version}" => "latest".to_owned(),
+            "{layer}" => "modules".to_owned(),
+            parameter if parameter.starts_with('{') => EXAMPLE_ID.to_owned(),
+            fixed => fixed.to_owned(),
+        };
+        let path: Vec<String> = path.split('/').map(segment).collect();
+        *next = format!("{}?limit=100&cursor={EXAMPLE_CURSOR}", path.join("/")).into();
+    }
+    example
 }
 
 fn whole(content: &Content, schemas: &Value) -> Option<Value> {
@@ -102,7 +123,7 @@ fn of(schema: &Value, schemas: &Value, depth: usize) -> Option<Value> {
         Some("number") => Some(1.5.into()),
         Some("boolean") => Some(true.into()),
         Some("string") => match schema["format"].as_str() {
-            Some("uuid") => Some("0b7a3f7e-59b1-4f0c-9f0d-3d6f3d1f7a11".into()),
+            Some("uuid") => Some(EXAMPLE_ID.into()),
             Some("date-time") => Some("2026-06-01T10:00:00Z".into()),
             _ => Some("text".into()),
         },

@@ -1,3 +1,4 @@
 //! The description of the API.
 
 pub mod examples;
+pub mod responses;
