@@ -23,6 +23,9 @@ const LENGTH_M: std::ops::RangeInclusive<f64> = 1.3..=2.7;
 /// lattice in many thousands has as much.
 const MIN_PAIRS: usize = 8;
 const MIN_SIGNIFICANCE: f64 = 5.0;
+/// Least difference of neighbouring seams in parts of what seams deviate from the glass: how pixels fall on a regular lattice
+/// alternates, too, but little.
+const MIN_CONTRAST: f64 = 0.15;
 /// Largest difference of the logarithms of sizes that perspective and tilt leave between lattices of a photo.
 const SAME_SIZE: f64 = 0.25;
 /// Least share of runs of an even number of halves in a lattice that does not alternate.
@@ -49,8 +52,9 @@ pub(super) fn join_halves(boxes: Vec<ModuleBox>, image: &RgbImage, gsd_m: Option
     let by_seams: Vec<Option<&Direction>> = lattices
         .iter()
         .map(|directions| {
-            let clear = directions.iter().filter(|direction| direction.significance >= MIN_SIGNIFICANCE);
-            clear.max_by(|a, b| a.significance.total_cmp(&b.significance))
+            let clear = directions.iter().filter_map(|direction| Some((direction, direction.significance()?)));
+            let clear = clear.filter(|(_, significance)| *significance >= MIN_SIGNIFICANCE);
+            clear.max_by(|a, b| a.1.total_cmp(&b.1)).map(|(direction, _)| direction)
         })
         .collect();
     let sizes: Vec<[f64; 2]> = by_seams.iter().flatten().map(|direction| direction.size_px).collect();
@@ -59,7 +63,8 @@ pub(super) fn join_halves(boxes: Vec<ModuleBox>, image: &RgbImage, gsd_m: Option
     for (directions, by_seams) in lattices.iter().zip(&by_seams) {
         let by_others = || directions.iter().find(|direction| direction.is_like(&sizes));
         let Some(direction) = by_seams.or_else(by_others) else { continue };
-        for (first, second) in direction.pairs() {
+        let Some(pairs) = direction.pairs() else { continue };
+        for (first, second) in pairs {
             joined.extend(join(&boxes[first], &boxes[second]));
         }
         for &index in direction.runs.iter().flat_map(|(_, run)| run) {
@@ -74,15 +79,14 @@ pub(super) fn join_halves(boxes: Vec<ModuleBox>, image: &RgbImage, gsd_m: Option
 struct Direction {
     /// Runs of neighbouring boxes, each with the place of its first box along the direction.
     runs: Vec<(i32, Vec<usize>)>,
-    /// Mean difference of neighbouring seams over its uncertainty, of the look that tells most.
-    significance: f64,
+    /// How far the seams behind even places differ from those behind odd ones; `None` where too few are seen.
+    alternation: Option<Look>,
     /// Of a box with its seam, along the direction and across it.
     size_px: [f64; 2],
-    /// Whether the seams behind even places deviate more from the glass than those behind odd ones.
-    even_is_stronger: bool,
 }
 
-/// How a seam looks: its grey against the glass beside it, summed with and without its sign.
+/// How a seam looks: its grey against the glass beside it, summed with and without its sign. Of an alternation, the mean
+/// differences of both over their uncertainties.
 #[derive(Clone, Copy)]
 struct Look {
     signed: f64,
@@ -113,6 +117,7 @@ impl Direction {
         }
         let mut signed = Vec::new();
         let mut strength = Vec::new();
+        let mut strengths = Vec::new();
         for (start, run) in &runs {
             let looks: Vec<Option<Look>> =
                 run.windows(2).map(|pair| look(&boxes[pair[0]], &boxes[pair[1]], image)).collect();
@@ -121,12 +126,19 @@ impl Direction {
                 let sign = if (start + place as i32).rem_euclid(2) == 0 { 1.0 } else { -1.0 };
                 signed.push(sign * (first.signed - second.signed));
                 strength.push(sign * (first.strength - second.strength));
+                strengths.push(first.strength);
             }
         }
-        let (signed, strength) =
-            if signed.len() < MIN_PAIRS { (0.0, 0.0) } else { (significance(&signed), significance(&strength)) };
-        let significance = signed.abs().max(strength.abs());
-        Some(Self { runs, significance, size_px: [length_px, width_px], even_is_stronger: strength > 0.0 })
+        let alternation = (signed.len() >= MIN_PAIRS).then(|| {
+            let least = MIN_CONTRAST * median(&mut strengths);
+            Look { signed: significance(&signed, least), strength: significance(&strength, least) }
+        });
+        Some(Self { runs, alternation, size_px: [length_px, width_px] })
+    }
+
+    /// Of the look that differs most.
+    fn significance(&self) -> Option<f64> {
+        self.alternation.map(|look| look.signed.abs().max(look.strength.abs()))
     }
 
     /// Whether this lattice, too short to alternate, is of halves because others of the photo with boxes of the same size are,
@@ -134,13 +146,14 @@ impl Direction {
     fn is_like(&self, sizes: &[[f64; 2]]) -> bool {
         let same = |a: f64, b: f64| (a / b).ln().abs() < SAME_SIZE;
         let even = self.runs.iter().filter(|(_, run)| run.len() % 2 == 0).count();
-        even as f64 >= MIN_EVEN * self.runs.len() as f64
+        self.alternation.is_none()
+            && even as f64 >= MIN_EVEN * self.runs.len() as f64
             && sizes.iter().any(|[length, width]| same(*length, self.size_px[0]) && same(*width, self.size_px[1]))
     }
 
     /// Pairs of boxes that make a module: whole runs of pairs where the ends of runs tell, else with the stronger seams
-    /// between modules.
-    fn pairs(&self) -> Vec<(usize, usize)> {
+    /// between modules. `None` where neither tells: half a module to the side all would be wrong.
+    fn pairs(&self) -> Option<Vec<(usize, usize)>> {
         let paired = |first: i32| -> Vec<(usize, usize)> {
             let of_run = |(start, run): &(i32, Vec<usize>)| {
                 let skipped = (first - start).rem_euclid(2) as usize;
@@ -151,12 +164,12 @@ impl Direction {
         let (even, odd) = (paired(0), paired(1));
         // Runs that begin and end with whole modules leave no half over one way, and two the other way.
         let decisive = self.runs.len().div_ceil(3).max(1);
-        let even_first = match even.len().abs_diff(odd.len()) {
-            difference if difference >= decisive => even.len() > odd.len(),
-            // Pairs that begin at even places have the seam behind an even place within.
-            _ => !self.even_is_stronger,
-        };
-        if even_first { even } else { odd }
+        if even.len().abs_diff(odd.len()) >= decisive {
+            return Some(if even.len() > odd.len() { even } else { odd });
+        }
+        let strength = self.alternation?.strength;
+        // Pairs that begin at even places have the seam behind an even place within.
+        (strength.abs() >= MIN_SIGNIFICANCE).then_some(if strength > 0.0 { odd } else { even })
     }
 }
 
@@ -210,9 +223,12 @@ fn look(a: &ModuleBox, b: &ModuleBox, image: &RgbImage) -> Option<Look> {
     Some(look)
 }
 
-/// Mean over its standard error, with outliers clipped to three times the median deviation.
-fn significance(values: &[f64]) -> f64 {
+/// Mean over its standard error, with outliers clipped to three times the median deviation; 0 where the median is below `least`.
+fn significance(values: &[f64], least: f64) -> f64 {
     let middle = median(&mut values.to_vec());
+    if middle.abs() < least {
+        return 0.0;
+    }
     let mut deviations: Vec<f64> = values.iter().map(|value| (value - middle).abs()).collect();
     let reach = 3.0 * 1.4826 * median(&mut deviations);
     let clipped: Vec<f64> = values.iter().map(|value| value.clamp(middle - reach, middle + reach)).collect();
@@ -300,6 +316,26 @@ mod tests {
         let (boxes, image) = bench(8, 4, [120, 210]);
         assert_eq!(join_halves(boxes.clone(), &image, Some(0.09)), boxes);
         assert_eq!(join_halves(boxes.clone(), &image, Some(0.02)), boxes);
+    }
+
+    #[test]
+    fn lattices_that_do_not_alternate_do_not_follow_those_that_do() {
+        let (mut boxes, mut image) = bench(8, 4, [120, 210]);
+        let (others, beside) = bench(8, 4, [150, 150]);
+        let down = image.height();
+        let mut both = RgbImage::new(image.width(), 2 * down);
+        image::imageops::replace(&mut both, &image, 0, 0);
+        image::imageops::replace(&mut both, &beside, 0, i64::from(down));
+        image = both;
+        let below = |b: ModuleBox| ModuleBox { center: b.center + Vector2::new(0.0, f64::from(down)), ..b };
+        boxes.extend(others.into_iter().map(below));
+        // And a lattice of two rows, too short to show either.
+        let (short, _) = bench(8, 2, [120, 210]);
+        boxes.extend(short.iter().map(|b| ModuleBox { center: b.center + Vector2::new(400.0, 0.0), ..*b }));
+        let mut wide = RgbImage::new(2 * image.width() + 200, image.height());
+        image::imageops::replace(&mut wide, &image, 0, 0);
+        let found = join_halves(boxes, &wide, Some(0.045));
+        assert_eq!(found.len(), 16 + 32 + 8);
     }
 
     #[test]
